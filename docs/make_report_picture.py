@@ -27,8 +27,6 @@ def take_picture(report: Path, output: Path) -> None:
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": SIZE_PX[0], "height": SIZE_PX[1]})
         page.goto(report.resolve().as_uri())
-        page.get_by_text("Distance", exact=True).click()
-        page.get_by_label("Left", exact=True).select_option(label="nerfacto")
         page.screenshot(path=output, type="jpeg", quality=80)
         browser.close()
 

@@ -203,8 +203,8 @@ def check_lpips() -> Iterator[Finding]:
         return
     path, url = lpips_weights()
     there = path.is_file()
-    found = str(path) if there else "no weights; LPIPS is left out"
-    remedy = f"Put the file of {url} at {path}. Nothing is downloaded automatically."
+    found = str(path) if there else "no weights of AlexNet: ours leave LPIPS out, nerfstudio's own methods need them"
+    remedy = f"Without a network nerfstudio's own methods fail at their start until the file of {url} is at {path}."
     yield _finding("LPIPS", there, found, remedy, "note")
 
 

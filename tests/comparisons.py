@@ -12,10 +12,12 @@ from rich.console import Console
 from scenes import FLIP, fisheye, view, write_scene
 
 from edge_depth_nerf.base.files import read_json, write_distance_png, write_json, write_png
+from edge_depth_nerf.base.pictures import colour_distance
 from edge_depth_nerf.compare.methods import MethodName, Preset
 from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.compare.results import RunResult
 from edge_depth_nerf.compare.specification import RunSpecification
+from edge_depth_nerf.report.compared_views import BY_VIEW, compared_views
 
 QUIET = Console(quiet=True)
 
@@ -86,6 +88,15 @@ def write_compared_scene(folder: Path) -> Path:
         meta["shifted_views"][str(metres)] = [entry]
     write_json(folder / "transforms.json", meta)
     return folder
+
+
+def write_rendered(scene: Path, folder: Path, gain: float) -> None:
+    """What a run that makes everything darker and nearer would leave."""
+    for index, seen in enumerate(compared_views(scene, {})):
+        rendered = (seen.rgb * gain).astype(np.uint8)
+        write_png(folder / f"eval_img_{index:04d}.png", np.hstack([seen.rgb, rendered]))
+        write_png(folder / f"eval_distance_{index:04d}.png", colour_distance(seen.distance_m * gain, seen.mask))
+    write_json(folder / BY_VIEW, {"0": {"masked_psnr": 30 * gain, "lidar_delta_1_25": gain}})
 
 
 def options(*scenes, **changes):

@@ -13,14 +13,16 @@ from types import ModuleType
 import numpy as np
 import pytest
 from benchmark_modules import benchmark_modules
-from comparisons import fake
+from comparisons import fake, write_rendered
+from scenes import write_scene
 from scipy.spatial.transform import Rotation
 
-from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.base.files import read_image, read_json, write_json
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.search import grids
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.recording import Recording
+from edge_depth_nerf.report.compared_views import compared_views
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "benchmarks" / "speed" / "results.json"
@@ -169,6 +171,28 @@ def test_the_real_drives_table_by_hand(benchmark_module):
     page = real.page(results, {"half": longer}).rstrip().splitlines()
     assert page[-2] == "| DS-NeRF loss, as many seconds as ours | 20.20 ± 0.28 | – | 0.250 | – | 100 |"
     assert page[-1].startswith("| ours |") and page[-1].endswith("| 120 |")
+
+
+def test_the_real_drives_picture_begins_with_what_was_recorded(benchmark_module, tmp_path):
+    scene, runs = write_scene(tmp_path / "scene", frames=20), []
+    for method, gain in (("nerfacto", 0.5), ("ds-nerf", 0.7), ("edge", 0.9)):
+        run = fake("scene", method, 0)
+        run.folder, run.specification["scene"] = tmp_path / method, str(scene)
+        write_rendered(scene, run.folder / "views", gain)
+        runs.append(run)
+    draw = benchmark_module("quality.real_drive").draw_views
+    draw(Results(runs), "scene", tmp_path / "views.png")
+    view = list(compared_views(scene, {}))[1]
+    height, width = view.mask.shape
+    drawn = read_image(tmp_path / "views.png")
+    assert drawn.shape == (28 + 4 * (height + 70 + 14), 2 * (width + 14), 3)
+    rows = [drawn[28 + 37 + row * (height + 84) :][:height, 7 : 7 + width] for row in range(4)]
+    assert (rows[0] == view.rgb).all()
+    assert [int(row[view.mask].mean()) for row in rows[1:]] == pytest.approx(
+        [view.rgb[view.mask].mean() * gain for gain in (0.5, 0.7, 0.9)], abs=2
+    )
+    draw(Results(runs[:2]), "scene", tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
 
 
 def test_the_real_drives_tables_are_those_of_its_runs(benchmark_module, kept, pages):

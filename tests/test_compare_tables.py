@@ -1,10 +1,12 @@
 """Tables by hand, of made-up runs."""
 
+import re
 import statistics
 
 import numpy as np
 import pytest
 from comparisons import fake
+from rich.console import Console
 from scenes import write_scene
 
 from edge_depth_nerf.base.errors import InputError
@@ -12,7 +14,7 @@ from edge_depth_nerf.base.files import write_json
 from edge_depth_nerf.compare import tables
 from edge_depth_nerf.compare.report import _of_drive
 from edge_depth_nerf.compare.results import Results, RunResult, check_fair
-from edge_depth_nerf.report.tables import latex_of_tables, page_of_tables
+from edge_depth_nerf.report.tables import latex_of_tables, page_of_tables, show_tables
 
 PSNR_OF = {
     ("street", "nerfacto"): (20.0, 21.0, 22.5),
@@ -73,6 +75,31 @@ def test_the_papers_figures_are_shown_with_its_preset_alone(results):
     assert "paper" not in said() and len(table(results, RIVALS).headings()) == 7
     results.options["preset"] = "paper"
     assert "(the paper's Table 1)" in said() and "averages do not follow" in said() and "+0.65" in said()
+
+
+def test_the_best_is_bold_everywhere(results, capsys):
+    made = table(results, RIVALS)
+    show_tables([made], Console(force_terminal=True, width=300))
+    said, page = capsys.readouterr().out, page_of_tables("Title", [], [made])
+    for row in made.rows:
+        for cell in row.cells:
+            assert not cell.best or (f"\x1b[1m{cell.text()}\x1b[0m" in said and f"**{cell.text()}**" in page)
+    assert len(re.findall("\x1b\\[1m\\d", said)) == page.count("**") // 2 == 6
+
+
+def test_the_verdict_by_hand(results):
+    assert tables.verdict(results).startswith("Ours renders held-out pictures 2.4 dB better than nerfacto (PSNR, ")
+    # AbsRel is 1 / PSNR in these runs
+    ours, theirs = (
+        np.mean([1 / psnr for (_, name), found in PSNR_OF.items() if name == method for psnr in found])
+        for method in ("edge", "nerfacto")
+    )
+    assert f"wrong by {ours:.1%} on average, nerfacto's by {theirs:.1%}." in tables.verdict(results)
+    for run in results.runs:
+        del run.figures["truth_abs_rel"]
+        run.figures["truth_masked_psnr"] *= -1
+    assert "2.4 dB worse than nerfacto (PSNR, a measure of quality)." in tables.verdict(results)
+    assert tables.verdict(Results([run for run in results.runs if run.method != "nerfacto"])) == ""
 
 
 def test_rivals_by_hand(results):

@@ -7,6 +7,7 @@ import math
 import re
 import shutil
 import subprocess
+import time
 from dataclasses import replace
 from typing import Any
 from xml.etree import ElementTree
@@ -16,9 +17,12 @@ import pytest
 import torch
 from comparisons import QUIET, copied, options, write_compared_scene
 from nerfstudio.utils.eval_utils import eval_setup
+from numba import njit
+from numba.core.event import install_listener
 
 from edge_depth_nerf.base.files import read_image, read_json, write_json
 from edge_depth_nerf.compare import command, tables
+from edge_depth_nerf.compare.worker import Clock
 
 pytestmark = pytest.mark.slow
 
@@ -42,7 +46,14 @@ def test_it_leaves_figures_tables_and_pictures(finished):
     metrics = {row["metric"] for row in rows if row["method"] == "edge"}
     assert {"masked_psnr", "truth_masked_ssim", "truth_affine_masked_psnr", "truth_abs_rel", "seconds"} <= metrics
     assert {"shifted_1m_masked_psnr", "shifted_2m_masked_psnr", "shifted_1m_truth_abs_rel"} <= metrics
-    assert {"detail_truth_masked_psnr", "detail_shifted_1m_masked_psnr"} <= metrics
+    assert {"detail_truth_masked_psnr", "detail_shifted_1m_masked_psnr", "truth_masked_flip"} <= metrics
+    by_view = read_json(results.runs[0].folder / "views/by_view.json")
+    for name in ("truth_masked_psnr", "truth_masked_flip"):
+        mean = np.mean([figures[name] for figures in by_view.values()])
+        assert mean == pytest.approx(results.runs[0].figures[name]) and len(by_view) == 2
+    pixels = [(figures["truth_pixels"], figures["truth_delta_1_25"]) for figures in by_view.values()]
+    pooled = np.average([share for _, share in pixels], weights=[count for count, _ in pixels])
+    assert pooled == pytest.approx(results.runs[0].figures["truth_delta_1_25"])
     assert np.isfinite([float(row["value"]) for row in rows]).all()
     tidy = json.loads((asked.output / "results.json").read_text())["rows"]
     assert [(row["metric"], row["value"]) for row in tidy] == [(row["metric"], float(row["value"])) for row in rows]
@@ -166,3 +177,18 @@ def test_an_interrupted_run_goes_on_at_its_checkpoint(finished, tmp_path):
     assert {row["value"] for row in again.rows() if row["method"] == "nerfacto"} == {
         row["value"] for row in results.rows() if row["method"] == "nerfacto"
     }
+
+
+def test_the_clock_stands_while_kernels_are_compiled():
+    clock, asked = Clock("cpu"), time.process_time()
+    with install_listener("numba:compile", clock):
+        clock.start()
+        njit(lambda numbers: (numbers * numbers).sum())(np.ones(3))  # which compiles further functions
+        with clock.stopped():
+            njit(lambda numbers: numbers.max())(np.ones(3))
+        compiled = time.process_time() - asked
+        while time.process_time() < asked + compiled + 0.1:
+            pass
+        with clock.stopped():
+            pass
+    assert 0.1 <= clock.passed["cpu_seconds"] < 0.1 + compiled / 2 and compiled > 0.2

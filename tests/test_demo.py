@@ -1,23 +1,34 @@
 """The demo, small: every stage for real."""
 
 import html
+import re
 import shlex
 import subprocess
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from comparisons import copied
+from comparisons import copied, fake, write_rendered
+from drives import SEQUENCE, write_room_drive
 from rich.console import Console
 
 from edge_depth_nerf import cli
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_image, read_json
+from edge_depth_nerf.base.files import read_image, read_json, write_json
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, side_by_side
+from edge_depth_nerf.compare import command as comparing
+from edge_depth_nerf.compare.command import Run
+from edge_depth_nerf.compare.specification import FIGURES, VIEWS
 from edge_depth_nerf.demo import command as demo
 from edge_depth_nerf.demo.options import DemoOptions
+from edge_depth_nerf.demo.recording import options_of
 from edge_depth_nerf.mono import estimate
+from edge_depth_nerf.process.converters import convert
+from edge_depth_nerf.process.options import Kitti360Options, RigOptions
+from edge_depth_nerf.synthetic.drive import synthesize_drive
+from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
 pytestmark = pytest.mark.slow
 
@@ -57,7 +68,8 @@ def test_it_leaves_figures_and_a_picture(finished):
     # one of distances, of three pictures 220 px wide
     assert picture.shape == (34 + 6 * 226 - 6 + 40, 3 * 226 - 6, 3), "with the scale of distances below"
     page = (options.output / "report.html").read_text(encoding="utf-8")
-    assert "<h1>Demo: nerfacto and ours on a rendered street</h1>" in page and "13 frames, 64 px, 8 steps each" in page
+    assert "<h1>Demo: nerfacto and ours on a rendered street</h1>" in page and "for 8 steps each" in page
+    assert '<p class="verdict">Ours renders held-out pictures ' in page and " than nerfacto (PSNR" in page
     assert "Table 1</i> Rivals" in page and "All 4 held-out views" in page
     for name, form in SHOWN.items():
         assert f">{results['figures']['ours'][name]:{form}}</td>" in page
@@ -97,7 +109,10 @@ def test_what_is_there_is_not_done_again(finished, monkeypatch, capsys):
     assert written == {path: path.stat().st_mtime_ns for path in options.output.rglob("*") if path.is_file()}
     said = capsys.readouterr().out
     assert f"{results['figures']['ours']['truth_masked_psnr']:.2f}" in said
-    assert str(options.output / "report.html") in said and results["viewer_commands"][1] in said
+    assert results["viewer_commands"][1] in said
+    *_, address, first, second, third = said.splitlines()
+    assert address == f"Open in a browser: {(options.output / 'report.html').as_uri()}"
+    assert ["nerfacto's" in first, "Distance error" in second, "bold" in third] == [True] * 3
 
 
 def test_an_interrupted_demo_is_finished(finished, tmp_path, monkeypatch):
@@ -112,6 +127,69 @@ def test_an_interrupted_demo_is_finished(finished, tmp_path, monkeypatch):
     found = demo.run_demo(replace(options, output=output), QUIET)
     assert found["figures"] == results["figures"]
     assert found["seconds"]["compare"] > results["seconds"]["compare"]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("recorded") / "my drive"
+    synthesize_drive(SynthesizeOptions(output=root, layout="rig", scene="parking", frames=14, size=48))
+    return root
+
+
+def test_a_recording_of_ones_own(recording, tmp_path, monkeypatch, capsys):
+    """Read and written for real; maps and trainings are made up."""
+
+    def train(runs: Sequence[Run], *_: object) -> None:
+        for run in runs:
+            better = run.specification.method == "edge"
+            write_rendered(Path(run.specification.scene), run.folder / VIEWS, 0.9 if better else 0.6)
+            (run.folder / "config.yml").touch()
+            made = fake("my drive", run.specification.method, 0, 25.0 if better else 22.5)
+            write_json(run.folder / FIGURES, {**made.content, "run": run.specification.to_dict()})
+
+    monkeypatch.setattr(comparing, "do_runs", train)
+    monkeypatch.setattr(comparing, "check_scene", lambda *_: "")
+    monkeypatch.setattr(demo, "process", lambda given, console: convert(replace(given, refine_poses=False), console))
+    monkeypatch.chdir(tmp_path)
+    results = demo.run_demo(DemoOptions(real=recording, frames=13, steps=9), Console(width=200))
+    page = (tmp_path / "outputs/demo_my drive/report.html").read_text(encoding="utf-8")
+    assert "<h1>Demo: nerfacto and ours on my drive</h1>" in page
+    assert "2.5 dB better than nerfacto (PSNR, a measure of quality); its distances are wrong by 4.0%" in page
+    typed = [cli.parse(shlex.split(line)[1:]) for line in results["commands"]]
+    assert typed[0] == DemoOptions(real=recording, frames=13, steps=9) and len(typed) == 3
+    scene = Path("outputs/demo_my drive/scenes/my drive")
+    assert typed[1] == cli.Process(RigOptions(root=recording, output=scene, frames=13))
+    assert len(read_json(scene / "transforms.json")["frames"]) == 13 * 3
+    assert "file:///" in capsys.readouterr().out
+
+
+def test_a_recording_is_checked_before_long_work(recording, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    without = copied(recording, tmp_path / "without")
+    text = (without / "rig.toml").read_text()
+    (without / "rig.toml").write_text(re.sub(r"\[lidars.*?(?=\n\[(?!lidars)|$)", "", text, flags=re.DOTALL))
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    for root, frames, message in (
+        (tmp_path / "nowhere", None, "no such folder"),
+        (empty, None, "no recording that can be read. Expected rig.toml"),
+        (without, None, "no LiDAR"),
+        (recording, 5, "5 usable frames, at --frames 5"),
+    ):
+        with pytest.raises((InputError, FileNotFoundError), match=message):
+            demo.run_demo(DemoOptions(real=root, frames=frames), QUIET)
+    assert not Path("outputs").exists()
+
+
+def test_what_kind_of_recording_a_folder_holds(tmp_path):
+    drive = write_room_drive(tmp_path / "room", frames=20)
+    found = options_of(drive.root, tmp_path / "out", 14)
+    assert isinstance(found, Kitti360Options) and (found.sequence, found.frames) == (SEQUENCE, 14)
+    for folder in ("2011_09_26/2011_09_26_drive_0005_sync", "sequences/07"):
+        root = tmp_path / folder.split("/")[0]
+        (root / folder).mkdir(parents=True)
+        with pytest.raises((InputError, FileNotFoundError), match=folder):
+            options_of(root, tmp_path / "out", 14)
 
 
 def test_other_options_need_another_folder(finished):

@@ -96,7 +96,8 @@ def test_another_nerfstudio(monkeypatch):
 def test_lpips_weights(monkeypatch, tmp_path):
     monkeypatch.setattr(metrics.torch.hub, "get_dir", lambda: str(tmp_path))
     missing = found(doctor.check_lpips)["LPIPS"]
-    assert missing.state == "note" and str(tmp_path) in missing.remedy and "https://" in missing.remedy
+    assert missing.state == "note" and "AlexNet" in missing.found and "nerfstudio's own methods need" in missing.found
+    assert str(tmp_path) in missing.remedy and "https://" in missing.remedy
     path, _ = metrics.lpips_weights()
     path.parent.mkdir(parents=True)
     path.write_bytes(b"")

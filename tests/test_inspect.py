@@ -231,8 +231,8 @@ def test_a_sheet_shows_the_maps(sample, sample_drive):
     """The picture is where it should be, and the truth beside it has the truth's colours."""
     _, output = sample
     sheet = read_image(output / "image_02_0000000003.png")
-    # two rows of four panels of 64 px, under two lines
-    assert sheet.shape == (2 * 28 + 2 * (64 + 70 + 14), 4 * (64 + 14), 3)
+    # three rows of three panels of 64 px, the last of them empty, under two lines
+    assert sheet.shape == (2 * 28 + 3 * (64 + 70 + 14), 3 * (64 + 14), 3)
     top, left = 2 * 28 + 7 + 30, 7
     picture = cv2.resize(
         read_image(sample_drive / "images/image_02/0000000003.png"), (64, 64), interpolation=cv2.INTER_AREA
@@ -240,7 +240,7 @@ def test_a_sheet_shows_the_maps(sample, sample_drive):
     assert (sheet[top : top + 64, left : left + 64] == picture).all()
     truth = read_distance_png(sample_drive / "truth/image_02/distance/0000000003.png")
     mask = cv2.imread(str(sample_drive / "masks/image_02.png"), cv2.IMREAD_GRAYSCALE) > 0
-    below, third = top + 64 + 70 + 14, left + 2 * (64 + 14)
+    below, third = top + 2 * (64 + 70 + 14), left
     shown = sheet[below : below + 64, third : third + 64]
     expected = colour_distance(truth, mask)
     candidates = [expected[row::2, column::2] for row in (0, 1) for column in (0, 1)]
@@ -542,10 +542,23 @@ def test_distances_from_motion_have_a_panel(drive, tmp_path):
     (with_motion,) = summary["sheets"]
     assert summary["maps"]["motion_coverage"]["mean"] == 1
     before, after = (read_image(path) for path in (tmp_path / "without" / name, tmp_path / "with" / with_motion))
-    # six panels in three columns; two more, motion and what the prior comes from, in four
-    assert (before.shape[1], after.shape[1]) == (3 * (200 + 14), 4 * (200 + 14))
-    last = after[-(150 + 70) :, -200:]
-    assert before.shape[0] == after.shape[0] and not (last == 255).all()
+    # six panels in three columns; two more, motion and what the prior comes from, in a row of their own
+    assert before.shape[1] == after.shape[1] == 3 * (200 + 14)
+    row = after[-(150 + 70) :]
+    assert after.shape[0] == before.shape[0] + 150 + 70 + 14 and not (row[:, 214:414] == 255).all()
+    assert (row[:, 435:] == 255).all()
+
+
+def test_a_sheet_and_a_view_from_above_are_as_wide_as_a_window(drive, tmp_path):
+    """Wider ones would be shrunk, and their letters with them."""
+    low = write_scene(tmp_path / "low", [pinhole(64, 28)])
+    spread_out = [replace(each, position_m=each.position_m * 50) for each in read_scene(drive).pictures]
+    figure = top_view(replace(read_scene(drive), pictures=tuple(spread_out)), None, [], [])
+    assert 1100 < drawn(figure).shape[1] < 1280
+    for scene in (drive, low):
+        inspect_scene(InspectOptions(scene, tmp_path / "out", frames=1), Console(quiet=True))
+        (sheet,) = (tmp_path / "out").glob("*_0*.png")
+        assert read_image(sheet).shape[1] == 3 * (410 + 14)
 
 
 def test_the_sheet_says_what_a_prior_comes_from(drive):

@@ -8,7 +8,7 @@ from torchvision.models import alexnet
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.method import metrics
-from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
+from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_flip, masked_lpips, masked_psnr, masked_ssim
 
 
 def pictures(seed: int = 0, height: int = 40, width: int = 50) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -30,6 +30,7 @@ def mean_difference(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 METRICS = {
     "masked_psnr": masked_psnr,
     "masked_ssim": masked_ssim,
+    "masked_flip": masked_flip,
     "masked_lpips": lambda pred, target, mask: masked_lpips(pred, target, mask, mean_difference),
 }
 
@@ -62,7 +63,14 @@ def test_equal_pictures():
     pred, _, mask = pictures()
     assert float(masked_psnr(pred, pred, mask)) == pytest.approx(100)
     assert float(masked_ssim(pred, pred, mask)) == pytest.approx(1)
-    assert float(METRICS["masked_lpips"](pred, pred, mask)) == 0
+    assert float(METRICS["masked_lpips"](pred, pred, mask)) == float(masked_flip(pred, pred, mask)) == 0
+
+
+def test_flip_of_green_and_blue():
+    """Without edges FLIP is the colours' distance, whose unit is that of green and blue."""
+    green, blue = torch.zeros(2, 60, 80, 3).unbind(0)
+    green[..., 1], blue[..., 2] = 1, 1
+    assert float(masked_flip(green, blue, torch.ones(60, 80, dtype=torch.bool))) == pytest.approx(1, abs=1e-3)
 
 
 def ssim_twin(pred: np.ndarray, target: np.ndarray, row: int, column: int) -> float:

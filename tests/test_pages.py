@@ -455,9 +455,6 @@ def test_the_slider_page_shows_both_methods_without_a_network(site, browser):
     assert 'href="slider.html"' in (site / "results.html").read_text(encoding="utf-8")
     page = browser.new_context(offline=True).new_page()
     page.goto((site / "slider.html").as_uri())
-    page.get_by_text("Distance", exact=True).click()
-    assert page.locator(".stage .tag").all_inner_texts() == ["ground truth", "ours"]
-    page.get_by_label("Left", exact=True).select_option(label="nerfacto")
     assert page.locator(".stage .tag").all_inner_texts() == ["nerfacto", "ours"]
     assert page.locator(".stage img.over").evaluate("image => image.naturalWidth") > 100
     page.get_by_role("link", name="Results").click()

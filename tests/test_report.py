@@ -13,12 +13,13 @@ import cv2
 import numpy as np
 import pytest
 import tyro
+from comparisons import write_rendered
 from html_page import Page
 from rich.console import Console
 from scenes import transforms, write_scene
 
 from edge_depth_nerf import cli
-from edge_depth_nerf.base.files import write_json, write_png
+from edge_depth_nerf.base.files import write_json
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB, colour_distance, distance_of_colours
 from edge_depth_nerf.compare.methods import METHODS
@@ -30,7 +31,12 @@ from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.report import views
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, build_report, write_report
-from edge_depth_nerf.report.compared_views import DISTANCE_KEYS, ComparedView, compared_views, held_out_frames
+from edge_depth_nerf.report.compared_views import (
+    BY_VIEW,
+    DISTANCE_KEYS,
+    ComparedView,
+    held_out_frames,
+)
 from edge_depth_nerf.report.points import ShownPoints, show_points
 from edge_depth_nerf.report.tables import Cell, MadeTable, Row
 from edge_depth_nerf.report.views import KINDS, ShownDrive, ShownView, encode, make_drives, show_view, spread
@@ -72,7 +78,7 @@ def test_errors_by_formula():
     mask = np.ones((size, size), bool)
     mask[:16] = False
     distances = {"m": colour_distance(rendered_m, mask)}
-    view = ComparedView("a.png", target, None, mask, true_m, "truth_distance_file_path", {"m": colours}, distances)
+    view = ComparedView("a.png", target, None, mask, true_m, "truth_distance_file_path", {"m": colours}, distances, {})
     shown = show_view(view, 10**6)
     assert set(shown.truth) == {"colour", "distance"} and set(shown.rendered["m"]) == {kind.key for kind in KINDS}
     truth = decoded(shown.truth["colour"])
@@ -87,20 +93,18 @@ def test_errors_by_formula():
     red, blue = distance_error[30, 24], distance_error[30, 72]
     assert red[0] > red[2] + 50 and blue[2] > blue[0] + 100  # 30 % too far, 50 % too near
     assert np.abs(distance_error[70, 24] - NO_VALUE_RGB).max() < 14
-    squared = (np.square(30 / 255) / 3) / 2
-    assert shown.figures["m"]["masked PSNR, dB"] == f"{-10 * np.log10(squared):.2f}"
-    assert shown.figures["m"]["δ<1.25, 2-40 m"] == "0.000"
-    right = show_view(replace(view, distances={"m": colour_distance(true_m * 1.1, mask)}), 10**6)
-    assert right.figures["m"]["δ<1.25, 2-40 m"] == "1.000"
+
+
+FOUND = {"masked_psnr": 20.0, "truth_masked_psnr": 21.0, "masked_flip": 0.125, "detail_masked_ssim": 0.5}
 
 
 def test_a_view_without_distances_has_no_errors_of_them():
     grey = np.full((20, 20, 3), 90, np.uint8)
     nothing = np.zeros((20, 20), np.float32)
-    view = ComparedView("a", grey, None, np.ones((20, 20), bool), nothing, None, {"m": grey}, {"m": grey})
+    view = ComparedView("a", grey, None, np.ones((20, 20), bool), nothing, None, {"m": grey}, {"m": grey}, {"m": FOUND})
     shown = show_view(view, 10**6)
     assert set(shown.truth) == {"colour"} and "distance-error" not in shown.rendered["m"]
-    assert list(shown.figures["m"]) == ["masked PSNR, dB"]
+    assert shown.figures == {"m": {"PSNR to clean ↑": "21.00", "FLIP ↓": "0.125"}}
 
 
 def test_lidar_points_are_spread_so_that_they_can_be_seen():
@@ -128,7 +132,7 @@ def test_pictures_are_small():
     mask, distance_m = np.ones(noise.shape[:2], bool), np.full(noise.shape[:2], 9, np.float32)
     colours = {"m": noise[::-1].copy()}
     view = ComparedView(
-        "a", noise, None, mask, distance_m, DISTANCE_KEYS[0], colours, {"m": colour_distance(distance_m)}
+        "a", noise, None, mask, distance_m, DISTANCE_KEYS[0], colours, {"m": colour_distance(distance_m)}, {}
     )
     shown = show_view(view, allowance)
     assert (shown.width, shown.height) == (640, 640)
@@ -146,14 +150,6 @@ def test_some_views_spread_over_the_drive():
     assert spread_over(5, 256) == [0, 1, 2, 3, 4] and spread_over(1000, 4) == [0, 333, 666, 999]
 
 
-def write_rendered(scene: Path, folder: Path, gain: float) -> None:
-    """What a run that makes everything darker and nearer would leave."""
-    for index, view in enumerate(compared_views(scene, {})):
-        rendered = (view.rgb * gain).astype(np.uint8)
-        write_png(folder / f"eval_img_{index:04d}.png", np.hstack([view.rgb, rendered]))
-        write_png(folder / f"eval_distance_{index:04d}.png", colour_distance(view.distance_m * gain, view.mask))
-
-
 def test_drives_are_read_from_what_runs_left(tmp_path):
     scene = write_scene(tmp_path / "x")
     write_rendered(scene, tmp_path / "one", 0.9)
@@ -167,10 +163,13 @@ def test_drives_are_read_from_what_runs_left(tmp_path):
     write_json(scene / "checks.json", {"figures": [], "warnings": ["roof is turned by 180°."]})
     (drive,) = make_drives({"x": (scene, {"one": tmp_path / "one", "two": tmp_path / "two"})}, console)
     assert drive.note.startswith("Warning of `process`: roof is turned by 180°. All ")
-    for view in drive.views:
-        one, two = (float(view.figures[name]["PSNR to clean, dB"]) for name in ("one", "two"))
-        assert one > two + 5
-        assert (view.figures["one"]["δ<1.25, 2-40 m"], view.figures["two"]["δ<1.25, 2-40 m"]) == ("1.000", "0.000")
+    assert drive.views[0].figures == {
+        "one": {"PSNR to clean ↑": "27.00", "δ<1.25 ↑": "0.900"},
+        "two": {"PSNR to clean ↑": "21.00", "δ<1.25 ↑": "0.700"},
+    }
+    (tmp_path / "two" / BY_VIEW).unlink()  # a run of an earlier version
+    (drive,) = make_drives({"x": (scene, {"one": tmp_path / "one", "two": tmp_path / "two"})}, console)
+    assert drive.views[0].figures == {"one": {}, "two": {}}
 
 
 def test_views_come_in_the_order_of_the_evaluation(tmp_path):
@@ -238,6 +237,7 @@ def test_a_broken_cloud_costs_the_view_in_3d_alone(tmp_path, capsys):
     [
         (("demo",), DemoOptions()),
         (("demo",), DemoOptions(output=Path("my folder/it's"), frames=13, scene="turn")),
+        (("demo",), DemoOptions(real=Path("my drive"), steps=9)),
         (
             ("compare",),
             CompareOptions(
@@ -288,7 +288,10 @@ def shown_view(number: int, distances: bool = True) -> ShownView:
 
     truth = {key: content for key, content in kinds("truth").items() if "error" not in key}
     rendered = {name: kinds(name) for name in COLOURS if name != "truth"}
-    figures = {name: {"PSNR, dB": f"2{number}.00"} for name in rendered}
+    figures = {
+        name: {"PSNR ↑": f"2{number + place}.00", "FLIP ↓": f"0.{number + place}"}
+        for place, name in enumerate(rendered)
+    }
     return ShownView(f"images/{number}.png", 64, 64, truth, rendered, figures)
 
 
@@ -328,6 +331,7 @@ def report(cloud) -> Report:
     return Report(
         title=NASTY,
         lead=NASTY,
+        verdict=NASTY,
         methods=["first", NASTY],
         drives=[
             ShownDrive("street", [shown_view(number) for number in range(3)], "3 of 10 views.", cloud),
@@ -477,13 +481,14 @@ def slider(page: Any) -> Any:
     return page.get_by_role("slider")
 
 
-def test_it_opens_with_truth_and_the_last_method(opened):
+def test_it_opens_with_the_distances_of_the_first_method_and_the_last(opened):
     page = opened()
     assert page.title().startswith(NASTY[:20])
     assert page.evaluate("window.hacked") is None
-    assert colour_of(pixel(page, 0.25)) == "red" and colour_of(pixel(page, 0.75)) == "blue"
-    assert slider(page).get_attribute("aria-valuetext").startswith("50 % ground truth, 50 % <")
-    assert page.locator(".stage img.over").get_attribute("alt").startswith(f"right: {NASTY}, colour of images/0.png")
+    assert colour_of(pixel(page, 0.25)) == "green" and colour_of(pixel(page, 0.75)) == "blue"
+    assert slider(page).get_attribute("aria-valuetext").startswith("50 % first, 50 % <")
+    assert page.locator(".stage img.over").get_attribute("alt").startswith(f"right: {NASTY}, distance of images/0.png")
+    assert page.locator(".verdict").inner_text() == NASTY
     for heading in ("Pictures", "Tables", "Plots", "Settings and versions", "Commands"):
         assert page.get_by_role("heading", name=heading, exact=True).is_visible()
     assert page.get_by_role("table").count() == 3  # with that of the view's figures; one is folded
@@ -500,7 +505,7 @@ def test_the_mouse_slides(opened):
     page.mouse.down()
     page.mouse.move(*across(0.8), steps=4)
     assert slider(page).input_value() == "80"
-    assert colour_of(pixel(page, 0.7)) == "red" and colour_of(pixel(page, 0.9)) == "blue"
+    assert colour_of(pixel(page, 0.7)) == "green" and colour_of(pixel(page, 0.9)) == "blue"
     page.mouse.move(box["x"] - 50, box["y"] + 10)  # beyond its edge
     assert slider(page).input_value() == "0" and colour_of(pixel(page, 0.3)) == "blue"
     page.mouse.up()
@@ -524,7 +529,7 @@ def test_a_finger_slides(opened):
         points = [] if share is None else [{"x": box["x"] + share * box["width"], "y": y}]
         session.send("Input.dispatchTouchEvent", {"type": event, "touchPoints": points})
     assert slider(page).input_value() == "75"
-    assert colour_of(pixel(page, 0.6)) == "red" and colour_of(pixel(page, 0.9)) == "blue"
+    assert colour_of(pixel(page, 0.6)) == "green" and colour_of(pixel(page, 0.9)) == "blue"
 
 
 def tab_to(page: Any, selector: str) -> None:
@@ -544,23 +549,24 @@ def test_the_keyboard_does_everything(opened):
     page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.className") == "skip"
     assert outline(page, ".handle") == "none"
+    tab_to(page, "input[name=kind]")
+    assert outline(page, "input[name=kind]:focus + span") == "solid"
+    page.keyboard.press("ArrowRight")
+    assert page.get_by_role("radio", name="Colour error", exact=True).is_checked()
+    assert page.locator(".legend").is_visible()
+    page.keyboard.press("ArrowLeft")
     tab_to(page, ".wipe")
     assert outline(page, ".handle") == "solid"  # where the focus is can be seen
     for key, value in (("ArrowRight", "51"), ("ArrowLeft", "50"), ("Home", "0"), ("End", "100"), ("PageDown", "90")):
         page.keyboard.press(key)
         assert slider(page).input_value() == value, key
-    assert colour_of(pixel(page, 0.8)) == "red"
-    tab_to(page, "input[name=kind]")
-    assert outline(page, "input[name=kind]:focus + span") == "solid"
-    page.keyboard.press("ArrowRight")
-    assert page.get_by_role("radio", name="Distance", exact=True).is_checked()
-    assert page.locator(".legend").is_visible()
+    assert colour_of(pixel(page, 0.8)) == "green"
     tab_to(page, "input[name=view]")
     assert outline(page, "input[name=view]:focus + img") == "solid"
     dark = pixel(page, 0.5)
     page.keyboard.press("ArrowRight")
     assert page.get_by_role("radio", name="2: images/1.png").is_checked()
-    assert pixel(page, 0.5)[0] > dark[0] + 50
+    assert pixel(page, 0.5)[1] > dark[1] + 50
     page.keyboard.press("ArrowLeft")
     assert np.abs(pixel(page, 0.5) - dark).max() < 4
 
@@ -584,7 +590,8 @@ def test_methods_kinds_and_drives_switch(opened):
     # no distances are known there
     assert page.get_by_role("radio", name="Distance error").is_disabled()
     assert page.get_by_role("radio", name="Colour", exact=True).is_checked()
-    assert page.locator(".figures td").all_inner_texts()[-1] == "25.00"
+    # bold is what is best, be it the left or the right one: the larger PSNR and the smaller FLIP
+    assert page.locator(".figures td.best").all_inner_texts() == ["0.5", "26.00"]
     assert page.locator(".drive-note").inner_text() == NASTY
     # sides that the drive has are kept
     assert page.get_by_label("Left", exact=True).locator("option:checked").inner_text() == "first"
@@ -593,7 +600,8 @@ def test_methods_kinds_and_drives_switch(opened):
 def test_an_error_names_what_stands_beside_it(opened):
     page = opened()
     tags = page.locator(".tag")
-    assert tags.all_inner_texts() == ["ground truth", NASTY]
+    assert tags.all_inner_texts() == ["first", NASTY]
+    page.get_by_label("Left", exact=True).select_option(label="ground truth")
     page.get_by_role("radio", name="Distance error").check(force=True)
     assert tags.all_inner_texts() == ["ground truth: distance", f"{NASTY}: distance error"]
     assert page.locator(".scale").evaluate_all("(all) => all.map((each) => each.firstChild.textContent)") == [
@@ -645,6 +653,14 @@ def test_points_are_seen_in_3d(opened, cloud):
     # another drive has no points
     page.get_by_label("Drive", exact=True).select_option(index=1)
     assert not page.locator("#points").is_visible()
+
+
+def test_on_a_phone_the_choices_stand_above_the_picture(opened):
+    page = opened(390, 844)
+    places = [page.locator(each).bounding_box()["y"] for each in (".choices", ".sides", ".stage", ".thumbnails")]
+    assert places == sorted(places)
+    desk = opened()
+    assert desk.locator(".choices").bounding_box()["x"] > desk.locator(".stage").bounding_box()["x"] + 400
 
 
 def test_tables_and_plots_fit_a_phone(opened):

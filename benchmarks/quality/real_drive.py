@@ -21,17 +21,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.commands import TUNED, ours
 from benchmarks.quality.unseen import with_spread
-from edge_depth_nerf.base.files import read_image, read_json, write_json, write_png, write_text
-from edge_depth_nerf.base.pictures import DISTANCE, colour_bar, lay_out, panel
+from edge_depth_nerf.base.files import read_json, write_json, write_png, write_text
+from edge_depth_nerf.base.pictures import DISTANCE, colour_bar, draw_points, lay_out, panel
 from edge_depth_nerf.compare.command import RUNS
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.options import MethodName
 from edge_depth_nerf.compare.results import Results, RunResult, read_results
 from edge_depth_nerf.compare.specification import VIEWS
+from edge_depth_nerf.report.compared_views import compared_view, held_out_frames
 
 TABLE: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf", "edge-paper", "edge")
 RIVALS: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf")
@@ -43,8 +43,8 @@ CELLS: dict[MethodName, MethodName] = {
 """Methods that differ from ours in loss, extras or prior alone, and whose λ and σ each takes: those of its loss."""
 SIZES = {"half": 2, "full": 1}
 HOLDOUT = ("--holdout-every", "6", "--holdout-beams", "10")
-SHOWN = ("img", "distance")
-"""Judged views that are drawn."""
+SHOWN = 1
+"""Number of the held-out picture that is drawn."""
 
 
 @dataclass(frozen=True)
@@ -139,17 +139,20 @@ def page(results: Results, longer: Mapping[str, Results]) -> str:
 
 
 def draw_views(results: Results, scene: str, path: Path) -> None:
-    """One held-out picture and its distances as nerfacto, DS-NeRF's loss and ours render them."""
-    panels: list[NDArray[np.uint8]] = []
-    for method in ("nerfacto", "ds-nerf", "edge"):
-        run = results.run(scene, method, results.seeds()[0])
-        if run is None:
-            return
-        beside_truth, distance = (read_image(run.folder / VIEWS / f"eval_{name}_0001.png") for name in SHOWN)
-        title, width = METHODS[method].title, beside_truth.shape[1] // 2
-        panels.append(panel(beside_truth[:, width:], title))
-        panels.append(panel(distance, f"{title}: distance", colour_bar(DISTANCE, width)))
-    write_png(path, lay_out(panels, 2, ["A held-out picture, rendered"]))
+    """One held-out picture and its LiDAR distances, then as nerfacto, DS-NeRF's loss and ours render both."""
+    runs = {method: results.run(scene, method, results.seeds()[0]) for method in ("nerfacto", "ds-nerf", "edge")}
+    views_of = {METHODS[name].title: run.folder / VIEWS for name, run in runs.items() if run is not None}
+    if len(views_of) < len(runs):
+        return
+    folder = Path(next(run for run in runs.values() if run is not None).specification["scene"])
+    view = compared_view(folder, held_out_frames(folder)[SHOWN], SHOWN, views_of)
+    height, width = view.mask.shape
+    points = draw_points(view.rgb, np.where(view.mask, view.distance_m, 0), (width, height))
+    bar = colour_bar(DISTANCE, width)
+    panels = [panel(view.rgb, "recorded"), panel(points, "recorded: LiDAR distance", bar)]
+    for title, colours in view.colours.items():
+        panels += [panel(colours, title), panel(view.distances[title], f"{title}: distance", bar)]
+    write_png(path, lay_out(panels, 2, ["A held-out picture, recorded and rendered"]))
 
 
 def main() -> None:

@@ -17,14 +17,22 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from edge_depth_nerf.base.files import read_distance_png, read_image, write_png
+from edge_depth_nerf.base.files import read_distance_png, read_image, write_json, write_png
 from edge_depth_nerf.compare.figures import ANGLE_EDGES_DEG, DISTANCE_EDGES_M, BinnedErrors, affine_fitted
 from edge_depth_nerf.method.edges import EdgeRecall, depth_edges_found, picture_edges_found
-from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR, DepthErrors, masked_lpips, masked_psnr, masked_ssim
+from edge_depth_nerf.method.metrics import (
+    LEAST_SQUARED_ERROR,
+    DepthErrors,
+    masked_flip,
+    masked_lpips,
+    masked_psnr,
+    masked_ssim,
+)
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
 from edge_depth_nerf.plugin.detail import detail_shown
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 from edge_depth_nerf.plugin.pipeline import evaluated
+from edge_depth_nerf.report.compared_views import BY_VIEW
 from edge_depth_nerf.scene.format import read_transforms
 
 PIXELS_PER_VIEW = 3000
@@ -196,15 +204,18 @@ class ViewEvaluator:
         self.pipeline = pipeline
         self.model: EdgeDepthNerfModel = pipeline.model
         self.on_view = on_view
+        self._by_view: dict[int, dict[str, float]] = {}
 
     def held_out(self, folder: Path) -> tuple[dict[str, float], dict[str, list[dict[str, float]]]]:
         """Evaluate all held-out views; colours and distance of each are saved in a folder, as `ns-eval` names them.
 
+        The figures of each view are saved there, too, in by_view.json.
+
         Returns:
-            The figures of `ns-eval` and, under affine_… and truth_affine_…, those after a colour fit; edge_recall and
-            so on; under camera_… the same of the cameras that are held out as a whole, which the others leave out
-            unless these are all; and the bins by_angle_deg and by_distance_m, against ground truth where it is known,
-            else against picture and LiDAR.
+            The figures of `ns-eval` and, under affine_… and truth_affine_…, those after a colour fit; masked_flip,
+            edge_recall and so on; under camera_… the same of the cameras that are held out as a whole, which the
+            others leave out unless these are all; and the bins by_angle_deg and by_distance_m, against ground truth
+            where it is known, else against picture and LiDAR.
         """
         dataset = self.pipeline.datamanager.eval_dataset
         by_angle, by_distance = BinnedErrors(ANGLE_EDGES_DEG), BinnedErrors(DISTANCE_EDGES_M)
@@ -233,6 +244,7 @@ class ViewEvaluator:
             # they were evaluated above if there are no others
             of_cameras = figures if {*main} == beside else self._mean(self._held_out_views(beside), save)
             figures |= {f"camera_{name}": value for name, value in of_cameras.items()}
+        write_json(folder / BY_VIEW, self._by_view)
         return figures, {"by_angle_deg": by_angle.compute(), "by_distance_m": by_distance.compute()}
 
     def with_detail(
@@ -318,12 +330,17 @@ class ViewEvaluator:
                         target = view.batch[key][..., :3].cpu()
                         fitted = affine_fitted(rgb, target, mask)
                         figures[f"{prefix}affine_masked_psnr"] = float(masked_psnr(fitted, target, mask))
+                        figures[f"{prefix}masked_flip"] = float(masked_flip(rgb, target, mask))
                         edges.update(f"{prefix}edge_recall", picture_edges_found(fitted, target, mask))
                 distance_m = outputs["depth"][..., 0].cpu() * model.metres_per_unit
+                of_view = self._by_view[view.number] = dict(figures)
                 for name in ("lidar", "truth"):
                     if (true_m := view.batch.get(DISTANCES[name])) is not None:
-                        known = depth_edges_found(distance_m, true_m[..., 0].cpu(), mask)
-                        edges.update(f"{name}_depth_edge_recall", known)
+                        true_m = true_m[..., 0].cpu()
+                        edges.update(f"{name}_depth_edge_recall", depth_edges_found(distance_m, true_m, mask))
+                        errors = DepthErrors()
+                        errors.update(distance_m, true_m, mask)
+                        of_view |= errors.compute(f"{name}_")
                 look(view, outputs, images)
                 found.append(figures)
                 self.on_view()

@@ -11,7 +11,7 @@ from edge_depth_nerf.base.files import read_json, read_json_object
 from edge_depth_nerf.compare.methods import METHODS
 from edge_depth_nerf.compare.results import Results, RunResult
 from edge_depth_nerf.compare.specification import OF_A_RUN, VIEWS
-from edge_depth_nerf.compare.tables import fields_table, introduction
+from edge_depth_nerf.compare.tables import fields_table, introduction, verdict
 from edge_depth_nerf.jobs.runs import viewer_command
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report
 from edge_depth_nerf.report.tables import MadeTable
@@ -32,6 +32,7 @@ def make_report(results: Results, tables: Sequence[MadeTable], plots: Sequence[P
         title=f"Comparison on {' and '.join(scenes) if len(scenes) < 3 else f'{len(scenes)} drives'}",
         lead=f"{', '.join(methods)}: trained with the same configuration except for "
         "each method's own fields, and evaluated alike on held-out views.",
+        verdict=verdict(results),
         methods=methods,
         drives=make_drives(drives, console),
         notes=introduction(results),

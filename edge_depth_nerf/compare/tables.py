@@ -97,11 +97,12 @@ def psnr_metric(results: Results) -> Metric:
 
 
 def quality_metrics(results: Results) -> list[Metric]:
-    """PSNR, SSIM and, where the weights were there, LPIPS, all inside the mask."""
+    """PSNR, SSIM, FLIP and, where the weights were there, LPIPS, all inside the mask."""
     truth = "truth_" if psnr_metric(results) is TRUE_PSNR else ""
     metrics = [
         psnr_metric(results),
         Metric(f"{truth}masked_ssim", "SSIM ↑", ".3f"),
+        Metric(f"{truth}masked_flip", "FLIP ↓", ".3f", -1),
         Metric(f"{truth}masked_lpips", "LPIPS ↓", ".3f", -1),
     ]
     return [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
@@ -358,6 +359,25 @@ def make_tables(results: Results) -> list[MadeTable]:
     return [replace(made, label=str(number)) for number, made in enumerate(tables, 1)]
 
 
+def verdict(results: Results) -> str:
+    """Say in a sentence what ours has over nerfacto, as means over drives and seeds; empty without both of them."""
+
+    def mean(method: MethodName, metric: str) -> float | None:
+        return mean_and_spread(list(per_seed(results, scenes, method, lambda run: run.figures.get(metric)).values()))[0]
+
+    scenes, psnr = results.scenes(), psnr_metric(results).name
+    ahead_db = ahead(results, scenes, "nerfacto", psnr).mean
+    if ahead_db is None:
+        return ""
+    word = "better" if ahead_db >= 0 else "worse"
+    text = f"Ours renders held-out pictures {abs(ahead_db):.1f} dB {word} than nerfacto (PSNR, a measure of quality)"
+    for reference in ("truth", "lidar"):
+        ours, theirs = (mean(method, f"{reference}_abs_rel") for method in ("edge", "nerfacto"))
+        if ours is not None and theirs is not None:
+            return f"{text}; its distances are wrong by {ours:.1%} on average, nerfacto's by {theirs:.1%}."
+    return f"{text}."
+
+
 def introduction(results: Results) -> list[str]:
     """What was compared and how, in lines."""
     steps = sorted({run.content["steps"] for run in results.runs})
@@ -372,9 +392,11 @@ def introduction(results: Results) -> list[str]:
         f"{', '.join(results.scenes())}.",
         "Seeds: " + "; ".join(seeds) + ".",
         f"Means over held-out views, PSNR in dB, inside the mask, against {against}; ± the standard deviation over "
-        "seeds.",
+        "seeds. Bold: the best of a column.",
         "Versions: " + ", ".join(f"{name} {number}" for name, number in results.versions.items()) + ".",
     ]
+    if any(name.endswith("masked_flip") for run in results.runs for name in run.figures):
+        lines.append("FLIP: the difference that a viewer sees, 0 (none) to 1.")
     if not any(name.endswith("lpips") for run in results.runs for name in run.figures):
         lines.append("LPIPS is missing: its weights were not on this machine.")
     if any(run.specification["implementation"] == "torch" for run in results.runs):

@@ -10,13 +10,14 @@ import random
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from numba.core.event import Event, Listener, install_listener
 from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
@@ -47,13 +48,14 @@ STEP_IN_BATCHES = 3
 """A step of training takes about as long as rendering so many batches of its rays."""
 
 
-class Clock:
-    """Seconds, and those of the processor, of what is measured."""
+class Clock(Listener):
+    """Seconds, and those of the processor, of what is measured. Compiling with Numba, as its events tell, stops it."""
 
     def __init__(self, device: str) -> None:
         """Measure nothing yet; `device` is what is waited for."""
         self._on_gpu = device.startswith("cuda")
         self._since: dict[str, float] | None = None
+        self._compiling: list[AbstractContextManager[None]] = []
         self.passed = {"seconds": 0.0, "cpu_seconds": 0.0}
         """Up to the last time that it was stopped."""
 
@@ -69,13 +71,24 @@ class Clock:
     @contextmanager
     def stopped(self) -> Iterator[None]:
         """Stop for something that does not count."""
-        if self._since is not None:
+        since, self._since = self._since, None
+        if since is not None:
             now = self._now()
-            self.passed = {name: self.passed[name] + now[name] - self._since[name] for name in now}
+            self.passed = {name: self.passed[name] + now[name] - since[name] for name in now}
         try:
             yield
         finally:
-            self.start()
+            if since is not None:
+                self.start()
+
+    def on_start(self, event: Event) -> None:
+        """Stop; within another function's compilation this changes nothing."""
+        self._compiling.append(self.stopped())
+        self._compiling[-1].__enter__()
+
+    def on_end(self, event: Event) -> None:
+        """Go on, if that is what was stopped."""
+        self._compiling.pop().__exit__(None, None, None)
 
 
 class MeasuredTrainer(EdgeDepthTrainer):
@@ -117,8 +130,9 @@ class MeasuredTrainer(EdgeDepthTrainer):
 
     def train(self) -> None:
         """Train to the end, by the clock."""
-        self.clock.start()
-        super().train()
+        with install_listener("numba:compile", self.clock):
+            self.clock.start()
+            super().train()
 
     def save_checkpoint(self, step: int) -> None:
         """Save what was measured, then the model."""

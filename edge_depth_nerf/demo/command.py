@@ -1,7 +1,7 @@
 """`edge-depth-nerf demo`: the whole way once, from a raw drive to compared figures and pictures.
 
-Each stage is a command that a user would give, `synthesize`, `process` and `compare`, and what it leaves under the
-output folder is not done again.
+Each stage is a command that a user would give, `synthesize` (unless the drive is a recording), `process` and `compare`,
+and what it leaves under the output folder is not done again.
 """
 
 from __future__ import annotations
@@ -24,9 +24,11 @@ from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.compare.specification import FIGURES
 from edge_depth_nerf.compare.tables import make_tables
 from edge_depth_nerf.demo.options import DemoOptions
+from edge_depth_nerf.demo.recording import options_of
 from edge_depth_nerf.jobs.runs import command_line, viewer_command
 from edge_depth_nerf.process.command import process
-from edge_depth_nerf.process.options import Kitti360Options
+from edge_depth_nerf.process.converters import name_of
+from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
 from edge_depth_nerf.report.build import Commands, Facts, Report, write_report
 from edge_depth_nerf.report.tables import show_tables
 from edge_depth_nerf.report.views import REPORT
@@ -36,35 +38,56 @@ from edge_depth_nerf.synthetic.options import SynthesizeOptions
 COMPARED: tuple[MethodName, ...] = ("nerfacto", "edge")
 """They differ in the depth loss and in what comes with it, the source of depth; nerfacto uses none."""
 RECORD, RESULTS, SECONDS, PICTURE = "demo.json", "results.json", "seconds.json", "comparison.png"
+RENDERED_FRAMES, RECORDED_FRAMES = 40, 30
+"""Frames of a drive where none are asked for."""
+WHAT_TO_LOOK_AT = (
+    "The first picture is one that no model was trained on: drag the slider between nerfacto's distances (left) and "
+    "ours (right).",
+    "Then choose Distance error: too near is blue, too far is red.",
+    "In the tables below, the best figure of each column is bold.",
+)
 
 
 @dataclass(frozen=True)
 class Stages:
     """The options of each stage."""
 
-    synthesis: SynthesizeOptions
-    processing: Kitti360Options
+    synthesis: SynthesizeOptions | None
+    """None: the drive is a recording."""
+    processing: ProcessOptions
     comparison: CompareOptions
 
     def commands(self) -> list[str]:
         """The commands that do the same, one after another."""
+        synthesis = [] if self.synthesis is None else [command_line(["edge-depth-nerf", "synthesize"], self.synthesis)]
         return [
-            command_line(["edge-depth-nerf", "synthesize"], self.synthesis),
-            command_line(["edge-depth-nerf", "process", "kitti360"], self.processing),
+            *synthesis,
+            command_line(["edge-depth-nerf", "process", name_of(self.processing)], self.processing),
             command_line(["edge-depth-nerf", "compare"], self.comparison),
         ]
 
 
 def stages_of(options: DemoOptions) -> Stages:
-    """Settle what each stage of a demo does."""
-    drive, scene = options.output / "drive", options.output / "scenes" / options.scene
-    synthesis = SynthesizeOptions(output=drive, scene=options.scene, frames=options.frames, size=options.size)
+    """Settle what each stage of a demo does; a recording is checked.
+
+    Raises:
+        FileNotFoundError: the recording, or a file of it, is missing.
+        InputError: an option or the recording cannot be used.
+    """
+    drive, scene, frames = options.folder / "drive", options.folder / "scenes" / options.scene_name, options.frames
+    if options.real is None:
+        frames = RENDERED_FRAMES if frames is None else frames
+        synthesis = SynthesizeOptions(output=drive, scene=options.scene, frames=frames, size=options.size)
+        processing = Kitti360Options(root=drive, sequence=synthesis.sequence, output=scene)
+    else:
+        synthesis = None
+        processing = options_of(options.real, scene, RECORDED_FRAMES if frames is None else frames)
     return Stages(
         synthesis,
-        Kitti360Options(root=drive, sequence=synthesis.sequence, output=scene),
+        processing,
         CompareOptions(
             scenes=(scene,),
-            output=options.output / "comparison",
+            output=options.folder / "comparison",
             methods=COMPARED,
             steps=options.steps,
             # side by side, each on its share of the cores: two threads do not make one training twice as fast
@@ -83,12 +106,16 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
         InputError: the output folder holds a demo of other options, or a training failed (its log is named).
     """
     console = console or Console()
-    output, stages = options.output, stages_of(options)
+    output = options.folder
     check_is_folder(output)
     # before the first stage takes its minute
+    stages = stages_of(options)
     for stage in (stages.synthesis, stages.processing, stages.comparison):
-        stage.check()
-    recorded = {key: value for key, value in asdict(options).items() if key != "output"}
+        if stage is not None:
+            stage.check()
+    unused = {"output", "real"} if options.real is None else {"output", "scene", "size"}
+    recorded = {name: str(value) if name == "real" else value for name, value in asdict(options).items()}
+    recorded = {name: value for name, value in recorded.items() if name not in unused and value is not None}
     record = output / RECORD
     if record.is_file() and read_json(record) != recorded:
         raise InputError(
@@ -103,20 +130,23 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
         write_json(record, recorded)
         results = _make(options, stages, recorded, console)
         write_json(finished, results)
-    say(console, f"Open in a browser: {output / REPORT}")
     say(console, f"Picture: {output / PICTURE}; figures: {finished}; tables: {compared / 'tables.md'}")
     say(console, "View the trained scenes:")
     for command in results["viewer_commands"]:
         say(console, f"  {command}")
+    say(console, f"Open in a browser: {(output / REPORT).resolve().as_uri()}")
+    for sentence in WHAT_TO_LOOK_AT:
+        say(console, f"  {sentence}")
     return results
 
 
 def _make(options: DemoOptions, stages: Stages, recorded: dict[str, Any], console: Console) -> dict[str, Any]:
     """Do all stages, show their tables, and write the page and the picture; give what results.json holds."""
-    output, compared = options.output, stages.comparison.output
+    output, compared = options.folder, stages.comparison.output
     clock = _Clock(output / SECONDS)
-    with clock.stage("synthesize"), told(console, "Synthesize"):
-        synthesize_drive(stages.synthesis)
+    if stages.synthesis is not None:
+        with clock.stage("synthesize"), told(console, "Synthesize"):
+            synthesize_drive(stages.synthesis)
     with clock.stage("process"), told(console, "Process"):
         process(stages.processing, console)
     with (
@@ -130,7 +160,7 @@ def _make(options: DemoOptions, stages: Stages, recorded: dict[str, Any], consol
     runs = {
         METHODS[run.method].title: run
         for run in comparison.runs
-        if run.method in COMPARED and (run.scene, run.seed) == (options.scene, 0)
+        if run.method in COMPARED and (run.scene, run.seed) == (options.scene_name, 0)
     }
     results = {
         "options": recorded,
@@ -141,22 +171,21 @@ def _make(options: DemoOptions, stages: Stages, recorded: dict[str, Any], consol
         "commands": [command_line(["edge-depth-nerf", "demo"], options), *stages.commands()],
         "viewer_commands": [viewer_command(run.config) for run in runs.values() if run.config],
     }
-    write_report(output / REPORT, _page(page, results))
-    write_bytes(output / PICTURE, (compared / picture_name(options.scene)).read_bytes())
+    write_report(output / REPORT, _page(page, options, results))
+    write_bytes(output / PICTURE, (compared / picture_name(options.scene_name)).read_bytes())
     return results
 
 
-def _page(page: Report, results: dict[str, Any]) -> Report:
+def _page(page: Report, options: DemoOptions, results: dict[str, Any]) -> Report:
     """The comparison's page, with what the stages before it did."""
-    options = results["options"]
+    rendered = "" if options.real else "a rendered "
     return replace(
         page,
-        title=f"Demo: nerfacto and ours on a rendered {options['scene']}",
-        lead="The same model trained twice on one drive: without depth, and with "
-        "the edge loss on integrated LiDAR and monocular depth. The drive: {scene}, {frames} frames, {size} px, "
-        "{steps} steps each.".format(**options),
+        title=f"Demo: nerfacto and ours on {rendered}{options.scene_name}",
+        lead="The same model was trained twice on one drive, for {steps} steps each: without depth, and with the edge "
+        "loss on integrated LiDAR and monocular depth.".format(**results["options"]),
         facts=[
-            Facts("Demo", {name.replace("_", " ").capitalize(): str(value) for name, value in options.items()}),
+            Facts("Demo", {name.capitalize(): str(value) for name, value in results["options"].items()}),
             *page.facts,
             Facts(
                 "Seconds of each stage",

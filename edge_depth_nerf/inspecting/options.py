@@ -22,8 +22,8 @@ class InspectOptions:
     """Folder for the pictures and summary.json. Not set: SCENE_inspection beside the scene."""
     frames: int = 4
     """Number of frames that get a sheet per camera, spread over the drive."""
-    size: tyro.conf.Suppress[int] = 640
-    """Longer side of each picture in a sheet, px."""
+    size: tyro.conf.Suppress[int] = 410
+    """Width of each picture in a sheet of three columns, px; the default makes a sheet as wide as a window."""
 
     def check(self) -> None:
         """Check the ranges.

@@ -33,11 +33,14 @@ ORIGIN_RGB: tuple[Colour, ...] = ((20, 20, 20), (150, 150, 150), (240, 170, 40),
 """Colour of each of `ORIGINS`."""
 
 
-def draw_sheet(scene: SceneFolder, figures: PictureFigures, maps: ShownMaps, longer_side_px: int) -> NDArray[np.uint8]:
-    """Draw the sheet of one picture. Panels of missing maps are left out."""
+def draw_sheet(scene: SceneFolder, figures: PictureFigures, maps: ShownMaps, width_px: int) -> NDArray[np.uint8]:
+    """Draw the sheet of one picture in three columns of this width, or two as wide together if the picture is low.
+
+    Panels of missing maps are left out.
+    """
     height, width = maps.usable.shape
-    scale = longer_side_px / max(height, width)
-    size = (max(round(width * scale), 1), max(round(height * scale), 1))
+    columns, shown_px = (3, width_px) if width < 2 * height else (2, (3 * width_px + 14) // 2)
+    size = (shown_px, max(round(height * shown_px / width), 1))
 
     def coloured(title: str, values: NDArray, shown: NDArray[np.bool_], colours: ColourScale) -> NDArray[np.uint8]:
         picture = colours.coloured(resize(values, size), resize(shown, size))
@@ -69,8 +72,7 @@ def draw_sheet(scene: SceneFolder, figures: PictureFigures, maps: ShownMaps, lon
             both = is_distance(maps.prior.distance_m) & is_distance(maps.truth_m)
             error = 100 * (maps.prior.distance_m / np.where(both, maps.truth_m, 1) - 1)
             panels.append(coloured("prior / ground truth", error, both, RELATIVE_ERROR))
-    columns = 4 if len(panels) > 6 else min(len(panels), 3)
-    return lay_out(panels, columns, _heading(scene, figures))
+    return lay_out(panels, min(len(panels), columns), _heading(scene, figures))
 
 
 def _mask_panel(maps: ShownMaps, size: tuple[int, int]) -> NDArray[np.uint8]:

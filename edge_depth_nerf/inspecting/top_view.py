@@ -22,7 +22,8 @@ from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX, known_steps
 from edge_depth_nerf.poses.matches import EpipolarAgreement
 from edge_depth_nerf.scene.reader import SceneFolder
 
-LARGEST_PX = (1600, 1100)
+LARGEST_PX = (1160, 900)
+"""Of the map. A wider figure would be shrunk to a window, and its letters with it."""
 LEAST_PX = 420
 """Least length of each side, so that the legend fits."""
 MARGIN_M = 12.0

@@ -56,11 +56,13 @@ class Report:
     facts: Sequence[Facts]
     commands: Sequence[Commands]
     methods: Sequence[str]
-    """The methods that have pictures; the page starts with the last one."""
+    """The methods that have pictures; the page starts with the first one beside the last one."""
     notes: Sequence[str] = field(default_factory=tuple)
     settings: Sequence[MadeTable] = field(default_factory=tuple)
     links: Mapping[str, str] = field(default_factory=dict)
     """Other pages beside this one: their titles, with their addresses."""
+    verdict: str = ""
+    """The result in a sentence."""
 
 
 def build_report(report: Report) -> str:

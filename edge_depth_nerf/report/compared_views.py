@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_depth_nerf.base.files import read_distance_png, read_image, read_mask
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import colour_distance
 from edge_depth_nerf.scene.format import LAYERS, read_transforms
 
 DISTANCE_KEYS = (LAYERS["truth_distance"].key, LAYERS["lidar"].key)
 """Sources of a view's distances, the better one first."""
+BY_VIEW = "by_view.json"
+"""In a folder of rendered views: the figures of each, by its number."""
 
 
 def held_out_frames(scene: Path) -> list[dict[str, Any]]:
@@ -48,6 +50,8 @@ class ComparedView:
     """Each run's rendered picture, black outside the mask."""
     distances: dict[str, NDArray[np.uint8]]
     """Each run's rendered median distances, in the colours of `colour_distance`."""
+    figures: dict[str, dict[str, float]]
+    """Each run's figures of this view, by name; empty where a run left none."""
 
     def rows(self) -> tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8]]]:
         """Return colours and distances: the recorded ones first, then each run's."""
@@ -64,12 +68,14 @@ def compared_view(scene: Path, frame: Mapping[str, Any], index: int, views_of: M
     mask = read_mask(scene / frame["mask_path"]) if "mask_path" in frame else np.ones(rgb.shape[:2], bool)
     key = next((key for key in DISTANCE_KEYS if key in frame), None)
     clean = frame.get(LAYERS["truth_rgb"].key)
-    colours, distances = {}, {}
+    colours, distances, figures = {}, {}, {}
     for name, folder in views_of.items():
         # nerfstudio saves ground truth and rendering side by side
         rendered = read_image(folder / f"eval_img_{index:04d}.png")[:, rgb.shape[1] :]
         colours[name] = np.where(mask[..., None], rendered, 0).astype(np.uint8)
         distances[name] = read_image(folder / f"eval_distance_{index:04d}.png")
+        by_view = folder / BY_VIEW
+        figures[name] = read_json(by_view).get(str(index), {}) if by_view.is_file() else {}
     return ComparedView(
         name=frame["file_path"],
         rgb=rgb,
@@ -79,6 +85,7 @@ def compared_view(scene: Path, frame: Mapping[str, Any], index: int, views_of: M
         distance_key=key,
         colours=colours,
         distances=distances,
+        figures=figures,
     )
 
 

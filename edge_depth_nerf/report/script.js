@@ -10,7 +10,7 @@
   const TRUTH = "truth";
   // which picture of the ground truth is shown beside an error
   const OF_TRUTH = { "colour-error": "colour", "distance-error": "distance" };
-  const state = { drive: 0, view: 0, kind: "colour", left: TRUTH, right: "" };
+  const state = { drive: 0, view: 0, kind: "distance", left: "", right: "" };
 
   const drive = () => data.drives[state.drive];
   const view = () => drive().views[state.view];
@@ -99,7 +99,9 @@
       row.className = name === state.left || name === state.right ? "shown" : "";
       make("th", titleOf(name), row).scope = "row";
       for (const title of columns) {
-        make("td", found[title], row);
+        const values = rows.map(([, of]) => Number(of[title]));
+        const best = title.includes("↓") ? Math.min(...values) : Math.max(...values);
+        make("td", found[title], row).className = rows.length > 1 && Number(found[title]) === best ? "best" : "";
       }
     }
   }
@@ -147,7 +149,8 @@
     for (const side of ["left", "right"]) {
       fillSelect(sides[side], names);
       if (!names.includes(state[side])) {
-        state[side] = side === "left" ? TRUTH : names[names.length - 1];
+        // nerfacto comes first and ours last; one alone stands beside the ground truth
+        state[side] = side === "left" && names.length > 2 ? names[1] : names[side === "left" ? 0 : names.length - 1];
       }
     }
     const thumbnails = find(".thumbnails");

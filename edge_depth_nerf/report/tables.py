@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def show_tables(tables: Sequence[MadeTable], console: Console) -> None:
         for group, heading in made.headings():
             table.add_column(f"{group}\n{heading}" if group else heading, justify="right")
         for row in made.rows:
-            table.add_row(row.title, *(cell.text() for cell in row.cells))
+            table.add_row(row.title, *(Text(cell.text(), "bold" * cell.best) for cell in row.cells))
         console.print(table)
 
 

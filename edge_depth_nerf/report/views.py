@@ -7,7 +7,6 @@ the true distance is 2 to 40 m. There, a distance beyond the colours' range has 
 from __future__ import annotations
 
 import base64
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -32,9 +31,9 @@ from edge_depth_nerf.base.pictures import (
     resize,
 )
 from edge_depth_nerf.masks.regions import from_nearest
-from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR
 from edge_depth_nerf.report.compared_views import ComparedView, compared_view, held_out_frames
 from edge_depth_nerf.report.points import MOST_POINTS, ShownPoints, show_points
+from edge_depth_nerf.report.tables import Metric
 from edge_depth_nerf.scene.reader import read_scene
 
 REPORT = "report.html"
@@ -47,8 +46,13 @@ WEBP_QUALITIES = ((1.0, 85), (1.0, 70), (1.0, 50), (0.7, 50), (0.5, 50), (0.5, 3
 """Share of the size, and quality. The first that makes a picture small enough is used, else the last."""
 ERROR_RANGE_M = (2.0, 40.0)
 """Range of true distances in which errors are shown."""
-WITHIN = 1.25
-"""Largest ratio to the true distance that counts as right."""
+VIEW_METRICS = (
+    Metric("masked_psnr", "masked PSNR ↑", ".2f"),
+    Metric("masked_ssim", "SSIM ↑", ".3f"),
+    Metric("masked_flip", "FLIP ↓", ".3f", -1),
+    Metric("delta_1_25", "δ<1.25 ↑", ".3f"),
+)
+"""Figures of a view; those of pictures and distances have the same ranges as in the tables."""
 SPREAD_PX = 1.6
 """Radius of a LiDAR point in a picture."""
 DIMMED = 0.35
@@ -203,7 +207,6 @@ def show_view(view: ComparedView, allowance: int) -> ShownView:
     if view.distance_key is not None:
         truth["distance"] = map_of(view.distance_m, usual, DISTANCE, radius)
     rendered: dict[str, dict[str, bytes]] = {}
-    figures: dict[str, dict[str, str]] = {}
     for name, colours in view.colours.items():
         error = colours.astype(np.float32) - target
         distance_m = distance_of_colours(view.distances[name])
@@ -212,16 +215,23 @@ def show_view(view: ComparedView, allowance: int) -> ShownView:
             "distance": map_of(distance_m, is_distance(distance_m), DISTANCE),
             "colour-error": map_of(np.abs(error).mean(-1) / 2.55, view.mask, COLOUR_ERROR),
         }
-        squared = float(np.square(error[view.mask] / 255).mean())
-        psnr = "masked PSNR, dB" if view.clean_rgb is None else "PSNR to clean, dB"
-        figures[name] = {psnr: f"{-10 * math.log10(max(squared, LEAST_SQUARED_ERROR)):.2f}"}
         if compared.any():
             ratio = np.where(compared, distance_m / np.where(compared, view.distance_m, 1), 1).astype(np.float32)
             rendered[name]["distance-error"] = map_of(100 * (ratio - 1), compared, RELATIVE_ERROR, radius)
-            ratio = ratio[compared]
-            close = float(((ratio < WITHIN) & (ratio > 1 / WITHIN)).mean())
-            figures[name]["δ<{:g}, {:g}-{:g} m".format(WITHIN, *ERROR_RANGE_M)] = f"{close:.3f}"
-    return ShownView(view.name, *size, truth, rendered, figures)
+    return ShownView(view.name, *size, truth, rendered, _figures(view))
+
+
+def _figures(view: ComparedView) -> dict[str, dict[str, str]]:
+    """Return the figures of a view that all methods have, by method; against ground truth if it is known."""
+    shown: dict[str, dict[str, str]] = {name: {} for name in view.figures}
+    for metric in VIEW_METRICS:
+        for name in (f"truth_{metric.name}", metric.name, f"lidar_{metric.name}"):
+            if all(name in found for found in view.figures.values()):
+                for method, found in view.figures.items():
+                    heading = "PSNR to clean ↑" if name == "truth_masked_psnr" else metric.heading
+                    shown[method][heading] = f"{found[name]:{metric.form}}"
+                break
+    return shown
 
 
 def spread(
