@@ -164,8 +164,8 @@ def test_drives_are_read_from_what_runs_left(tmp_path):
     (drive,) = make_drives({"x": (scene, {"one": tmp_path / "one", "two": tmp_path / "two"})}, console)
     assert drive.note.startswith("Warning of `process`: roof is turned by 180°. All ")
     assert drive.views[0].figures == {
-        "one": {"PSNR to clean ↑": "27.00", "δ<1.25 ↑": "0.900"},
-        "two": {"PSNR to clean ↑": "21.00", "δ<1.25 ↑": "0.700"},
+        "one": {"masked PSNR ↑": "27.00", "δ<1.25 ↑": "0.900"},
+        "two": {"masked PSNR ↑": "21.00", "δ<1.25 ↑": "0.700"},
     }
     (tmp_path / "two" / BY_VIEW).unlink()  # a run of an earlier version
     (drive,) = make_drives({"x": (scene, {"one": tmp_path / "one", "two": tmp_path / "two"})}, console)

@@ -34,7 +34,7 @@ MOST_LINES = {
     "edge_depth_nerf/process/colmap": 1_750,
     "edge_depth_nerf/process/kitti": 440,
     "edge_depth_nerf/process/kitti360": 660,
-    "edge_depth_nerf/report": 770,
+    "edge_depth_nerf/report": 780,
     "edge_depth_nerf/scene": 2_180,
     "edge_depth_nerf/stereo": 960,
     "edge_depth_nerf/synthetic": 3_700,

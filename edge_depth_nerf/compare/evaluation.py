@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -330,7 +331,8 @@ class ViewEvaluator:
                         target = view.batch[key][..., :3].cpu()
                         fitted = affine_fitted(rgb, target, mask)
                         figures[f"{prefix}affine_masked_psnr"] = float(masked_psnr(fitted, target, mask))
-                        figures[f"{prefix}masked_flip"] = float(masked_flip(rgb, target, mask))
+                        if find_spec("flip_evaluator"):
+                            figures[f"{prefix}masked_flip"] = float(masked_flip(rgb, target, mask))
                         edges.update(f"{prefix}edge_recall", picture_edges_found(fitted, target, mask))
                 distance_m = outputs["depth"][..., 0].cpu() * model.metres_per_unit
                 of_view = self._by_view[view.number] = dict(figures)
