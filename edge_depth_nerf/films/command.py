@@ -113,8 +113,12 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
     write_json(output, path_file(to_model.poses(poses), lens, options, fps))
     if warning := outside(poses, scene):
         say(console, warning, "yellow")
+    rays = lens.rays(options.camera)
+    if options.camera == "fisheye":
+        # everybody expects nothing outside the lens's circle
+        rays = rays[-rays[:, 2] > math.cos(scene.theta_max_rad)]
     # lengths of other scenes are no metres
-    unseen = TrainingViews(scene).unseen_share(poses, lens.rays(options.camera)) if scene.own else 0.0
+    unseen = TrainingViews(scene).unseen_share(poses, rays) if scene.own else 0.0
     if unseen > UNSEEN_SHARE:
         say(
             console,
