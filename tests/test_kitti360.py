@@ -505,7 +505,7 @@ def test_frames_without_pose_sweep_or_picture_are_listed_and_skipped(tmp_path: P
         Skipped(7, None, "no sweep"),
         Skipped(9, "image_03", "no picture"),
     )
-    assert "Skipped no pose: 0, 3-4; no sweep: 7; no picture of image_03: 9" in console.export_text()
+    assert "Left out: no pose: 0, 3-4; no sweep: 7; no picture of image_03: 9" in console.export_text()
     meta = read_json(tmp_path / "scene/transforms.json")
     by_camera = {n: [f["frame"] for f in meta["frames"] if f["camera"] == n] for n in CAMERAS}
     # moments in order: 1 2 5 6 8 9 10 11, of which the fifth, 8, is held out

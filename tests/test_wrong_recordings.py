@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -86,6 +87,15 @@ def turned(degrees: float) -> Change:
     return moved(Rotation.from_euler("z", degrees, degrees=True).as_matrix())
 
 
+def rigid_turn(degrees: float) -> np.ndarray:
+    found = np.eye(4)
+    found[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    return found
+
+
+turned_5 = turned(5)
+
+
 def pictures_later(seconds: float) -> Change:
     return lambda recording: replace(
         recording, pictures=tuple(replace(one, time_s=one.time_s + seconds) for one in recording.pictures)
@@ -118,7 +128,7 @@ def test_a_good_drive_gives_no_warning(whole: Recording) -> None:
     [
         (turned(180), "roof is turned by 180° about its z axis"),
         (turned(90), "roof is turned by -90° about its z axis"),
-        (turned(5), "roof is turned by -5.0° about its z axis"),
+        (turned_5, "roof is turned by -5.0° about its z axis"),
         (moved(np.diag([1.0, -1, 1])), r"roof is given in other axes, where \(x, -y, z\) is x, y, z"),
         (moved(np.eye(3) * 3.28084), r"the points of roof in feet\? metres_per_unit = 0.3048"),
         (beside(0.6), r"roof sits -0\.[4-7]\d m further along its y axis"),
@@ -133,6 +143,9 @@ def test_a_good_drive_gives_no_warning(whole: Recording) -> None:
 def test_what_is_wrong_is_named(recording: Recording, change: Change, said: str) -> None:
     (warning,) = checked(change(recording)).warnings
     assert re.search(said, warning), warning
+    if change is turned_5:
+        rows = np.array(ast.literal_eval(re.search(r"to_vehicle = (\[.*\])\)", warning)[1]))  # pyright: ignore
+        assert np.allclose(rows, recording.sweeps[0].to_vehicle @ rigid_turn(-5), atol=0.01)
 
 
 @pytest.mark.parametrize(
@@ -281,6 +294,12 @@ def test_poses_no_vehicle_has_are_named(
     found = of_path(with_path(recording, change))
     assert len(found) == (said is not None), found
     assert said is None or said in found[0]
+
+
+def test_poses_of_a_sensor_are_named(recording: Recording) -> None:
+    (camera,) = recording.cameras
+    (warning,) = of_path(with_path(recording, lambda poses: poses @ camera.to_vehicle))
+    assert "on its side" in warning and 'the poses are those of right: poses.of = "right"' in warning
 
 
 def test_a_path_with_a_jump_is_named(recording: Recording) -> None:

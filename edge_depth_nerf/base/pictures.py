@@ -245,7 +245,9 @@ def legend(names: Sequence[tuple[str, Colour]], width: int, scale: ColourScale |
     from matplotlib.colors import ListedColormap, LogNorm, Normalize
     from matplotlib.patches import Patch
 
-    figure, size = _blank(width, 40), min(14.0, width / 30)
+    # in a font's size, a letter is about 0.8 px wide, and a patch with its gaps 6
+    letters = sum(len(name) for name, _ in names)
+    figure, size = _blank(width, 40), min(14.0, width / 30, width / (0.8 * letters + 6 * len(names) + 1))
     patches = [Patch(color="#{:02x}{:02x}{:02x}".format(*colour), label=name) for name, colour in names]
     place = "center left" if scale is None else "center right"
     figure.legend(

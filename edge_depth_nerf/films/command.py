@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +90,9 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
         scene, to_model = placed(options.load_config, options.scene)
 
     pictures = _followed(scene, options.follow)
+    shown = camera_of(options, pictures[0].lens)
+    options = replace(options, camera=shown)
+    options.check()
     drive = CameraPath(_times_s(pictures), poses_of(pictures), up_of(np.stack([p.rotation for p in scene.pictures])))
     lens = film_lens(pictures[0].lens, options)
     fps = options.fps or round(drive.frame_rate_hz, 3)
@@ -113,8 +116,8 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
     write_json(output, path_file(to_model.poses(poses), lens, options, fps))
     if warning := outside(poses, scene):
         say(console, warning, "yellow")
-    rays = lens.rays(options.camera)
-    if options.camera == "fisheye":
+    rays = lens.rays(shown)
+    if shown == "fisheye":
         # everybody expects nothing outside the lens's circle
         rays = rays[-rays[:, 2] > math.cos(scene.theta_max_rad)]
     # lengths of other scenes are no metres
@@ -140,22 +143,27 @@ def film_lens(lens: KannalaBrandt | Pinhole, options: CameraPathOptions) -> Film
     Raises:
         InputError: the computed height is out of range.
     """
-    own = lens.width / lens.height
+    camera, own = camera_of(options, lens), lens.width / lens.height
     wide = own if isinstance(lens, Pinhole) else 16 / 9
-    aspect = {"fisheye": own, "perspective": wide, "equirectangular": 2.0}[options.camera]
-    width = options.width or _even(2.0 * lens.height if options.camera == "equirectangular" else float(lens.width))
+    aspect = {"fisheye": own, "perspective": wide, "equirectangular": 2.0}[camera]
+    width = options.width or _even(2.0 * lens.height if camera == "equirectangular" else float(lens.width))
     height = _even(width / aspect)
     if max(width, height) > LARGEST_PX:
         raise InputError(f"the film would be {width}×{height} px, more than {LARGEST_PX}. Give a smaller --width.")
-    if options.camera == "equirectangular":
+    if camera == "equirectangular":
         return FilmLens(width, height, height / 2)
-    if options.camera == "perspective":
+    if camera == "perspective":
         # what a wider lens shows beyond would be stretched
         fov_deg = options.fov_deg or (own_fov_deg(lens) if isinstance(lens, Pinhole) else min(own_fov_deg(lens), 90.0))
         return FilmLens(width, height, width / 2 / math.tan(math.radians(fov_deg) / 2))
     if options.fov_deg is None and isinstance(lens, KannalaBrandt):
         return FilmLens(width, height, lens.fx * width / lens.width)
     return FilmLens(width, height, width / math.radians(options.fov_deg or own_fov_deg(lens)))
+
+
+def camera_of(options: CameraPathOptions, lens: KannalaBrandt | Pinhole) -> FilmCamera:
+    """The kind of the film's camera: as asked for, or that of the drive's lens."""
+    return options.camera or ("perspective" if isinstance(lens, Pinhole) else "fisheye")
 
 
 def own_fov_deg(lens: KannalaBrandt | Pinhole) -> float:

@@ -29,9 +29,9 @@ class CameraPathOptions:
     """The scene folder, only needed if it was moved after the training."""
     kind: Kind = "replay"
     """replay: along the recorded path. lane-shift: to one side of it and back. orbit: a circle around a point ahead."""
-    camera: FilmCamera = "fisheye"
+    camera: FilmCamera | None = None
     """fisheye: equidistant, with the scale of the drive's lens. perspective: a pinhole that looks ahead.
-    equirectangular: the whole sphere."""
+    equirectangular: the whole sphere. Not set: as the drive's lens is."""
     output: Path | None = None
     """The path file. Not set: camera_paths/KIND_CAMERA.json beside config.yml."""
     follow: str | None = None
@@ -66,10 +66,10 @@ class CameraPathOptions:
             )
         if self.fov_deg is not None and self.camera == "equirectangular":
             raise InputError("--fov-deg: an equirectangular film always shows the whole sphere. Leave this option out.")
-        if self.fov_deg is not None and not 1 <= self.fov_deg <= LARGEST_FOV_DEG[self.camera]:
+        camera = self.camera or "fisheye"
+        if self.fov_deg is not None and not 1 <= self.fov_deg <= LARGEST_FOV_DEG[camera]:
             raise InputError(
-                f"--fov-deg {self.fov_deg}: expected 1 to {LARGEST_FOV_DEG[self.camera]:g} degrees for "
-                f"--camera {self.camera}."
+                f"--fov-deg {self.fov_deg}: expected 1 to {LARGEST_FOV_DEG[camera]:g} degrees for --camera {camera}."
             )
         for name, value in (("fps", self.fps), ("seconds", self.seconds), ("radius-m", self.radius_m)):
             if value is not None and not (math.isfinite(value) and value > 0):

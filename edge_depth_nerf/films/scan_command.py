@@ -196,7 +196,7 @@ def _show(figures: dict[str, dict[str, float]], console: Console) -> None:
         text = (
             f"{_WORDS[name]}, {found['rays']:,.0f} rays: the rendered distance is off by "
             f"{100 * found['median_m']:.1f} cm (median) and {found['p95_m']:.2f} m (95 %); {found['within_10_cm']:.1%} "
-            f"are within 10 cm, {found['within_30_cm']:.1%} within 30 cm."
+            f"are within 10 cm, {found['within_30_cm']:.1%} within 30 cm, also where no camera looked."
         )
         if "drop_f1" in found:
             text += (

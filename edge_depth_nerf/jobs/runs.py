@@ -138,16 +138,19 @@ def viewer_command(config: Path) -> str:
     return f"ns-viewer --load-config {shlex.quote(str(config))} --viewer.websocket-host 127.0.0.1"
 
 
-def commands_after(config: Path, scene: Path, preset: str) -> dict[str, str]:
-    """What to do with a trained model next, and the command for it."""
+def commands_after(config: Path, scene: Path, preset: str, compares: bool = True) -> dict[str, str]:
+    """What to do with a trained model next, and the command for it; `compares`: whether the scene can be compared."""
     given = f"--load-config {shlex.quote(str(config))}"
     compared = f"{shlex.quote(str(scene))} --output {shlex.quote(str(config.parents[2] / 'comparison'))}"
-    return {
+    found = {
         "View it": viewer_command(config),
-        "Evaluate it": f"ns-eval {given} --output-path {shlex.quote(str(config.with_name('figures.json')))}",
+        "Evaluate it": f"ns-eval {given} --output-path {shlex.quote(str(config.with_name('figures.json')))} "
+        f"--render-output-path {shlex.quote(str(config.with_name('held_out')))}",
         "Make a film": f"edge-depth-nerf camera-path {given}",
-        "Compare": f"edge-depth-nerf compare {compared} --preset {preset} --methods nerfacto edge",
     }
+    if compares:
+        found["Compare"] = f"edge-depth-nerf compare {compared} --preset {preset} --methods nerfacto edge"
+    return found
 
 
 def command_line(words: Sequence[str], options: Any) -> str:

@@ -432,8 +432,8 @@ def training_split(scene: SceneFolder) -> Split:
     """
     if not all("lidar" in picture.files for picture in scene.pictures):
         raise InputError(
-            f"{scene.path}: has no LiDAR maps, which the network is trained on. Give weights with --model, or train on "
-            "a scene with LiDAR."
+            f"{scene.path}: has no LiDAR maps, which the network is trained on. Name a ready-made network by --hf, "
+            "maps of any network by --maps, or weights that a scene with LiDAR has given by --model (docs/mono.md)."
         )
     if not scene.split_known:
         raise InputError(

@@ -242,7 +242,7 @@ class FisheyeDepth(Nerfstudio):
         if self.config.downscale_factor != 1:
             raise InputError(
                 f"{path}: downscale_factor is {self.config.downscale_factor}, but pictures and maps are used in the "
-                "size that the scene has. Run `edge-depth-nerf process … --downscale K` instead."
+                "size that the scene has. Leave the option out, or process the drive with --downscale."
             )
 
     def _metres_per_unit(self, frames: list[dict[str, Any]]) -> float:

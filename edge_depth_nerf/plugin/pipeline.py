@@ -99,11 +99,13 @@ class EdgeDepthPipeline(VanillaPipeline):
         model, data = config.model, config.datamanager
         assert isinstance(model, EdgeDepthNerfModelConfig) and isinstance(data, FisheyeDepthDataManagerConfig)
         if model.depth_loss != "none" and data.depth_source == "auto" and not _has_depth(data):
-            CONSOLE.log(
-                f"[yellow]{escape(str(data.dataparser.data))}: the scene has no depth maps (LiDAR, monocular or from "
-                "motion), so there is no prior and this training is plain nerfacto. `edge-depth-nerf estimate-depth` "
-                "makes monocular maps."
-            )
+            scene = escape(str(data.dataparser.data))
+            if kwargs.get("test_mode", "val") == "val":
+                CONSOLE.log(
+                    f"[yellow]{scene}: the scene has no depth maps (LiDAR, monocular or from motion), so this is "
+                    "nerfacto without a depth loss, with our exposure, scale and held-out pictures. `edge-depth-nerf "
+                    f"estimate-depth {scene} --hf NETWORK` makes monocular maps (docs/mono.md)."
+                )
             model = replace(model, depth_loss="none")
             config = replace(config, model=model)
         if model.depth_loss == "none":

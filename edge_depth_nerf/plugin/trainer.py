@@ -32,6 +32,7 @@ from edge_depth_nerf.jobs.runs import checkpoints_in, commands_after, newest_che
 from edge_depth_nerf.kernels.table_adam import TableAdam
 from edge_depth_nerf.kernels.threads import torch_on_one_thread
 from edge_depth_nerf.plugin.compat import count_steps_against_all, ignore_deprecations_of_host, total_steps
+from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, transforms_path
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
 from edge_depth_nerf.plugin.pipeline import EdgeDepthPipeline, NotFiniteError
@@ -218,8 +219,12 @@ class EdgeDepthTrainer(Trainer):
 
     def _say_next(self) -> None:
         config, preset = self.base_dir / "config.yml", PRESETS.get(str(self.config.method_name), "lite")
-        scene = Path(self.pipeline.datamanager.get_datapath())
-        lines = [f"{what}: {command}" for what, command in commands_after(config, scene, preset).items()]
+        manager = self.pipeline.datamanager
+        assert isinstance(manager, FisheyeDepthDataManager)
+        # without held-out pictures of its own, or without depth, there is nothing to compare
+        compares = manager.train_dataset.scene.split_known and manager.config.depth_source != "none"
+        commands = commands_after(config, Path(manager.get_datapath()), preset, compares)
+        lines = [f"{what}: {command}" for what, command in commands.items()]
         CONSOLE.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
 
     def _threads(self) -> AbstractContextManager[None]:

@@ -116,7 +116,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     if checked.figures or not (options.output / CHECKS).is_file():
         write_json(options.output / CHECKS, dataclasses.asdict(checked))
     if recording.skipped:
-        say(console, f"Skipped {summarise(recording.skipped)}", "yellow")
+        say(console, f"Left out: {summarise(recording.skipped)}", "yellow")
     held_out, masks = _held_out(recording, options), vehicle_masks(recording)
     if options.find_moving:
         recording, more = find_moving(recording, options, held_out, masks, console)
@@ -213,6 +213,9 @@ def _checked(recording: Recording, options: ProcessOptions, console: Console) ->
         found = dataclasses.replace(found, warnings=(*of_path, *of_masks, *found.warnings))
     if options.strict and found.warnings:
         raise InputError(" ".join(found.warnings) + " Without --strict this is a warning.")
+    # they are repeated at the end; whoever sees them now may stop
+    for warning in found.warnings:
+        say(console, warning, "yellow")
     return found
 
 

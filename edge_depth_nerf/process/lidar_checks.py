@@ -95,8 +95,9 @@ _DOUBT = 0.3
 off."""
 _TRIED_WHOLE = 8
 """So many readings, the best on some of the pairs, are tried on all of them."""
-_LEAST_GAINS = (0.25, 0.01)
-"""Of a small angle or shift, contrast must gain so much, and edges: on bare walls edges alone would fit by chance."""
+_LEAST_GAINS, _LEAST_GAINS_WITH_SWEEPS = (0.25, 0.01), (0.05, 0.01, 0.4)
+"""Of a small angle or shift, contrast must gain so much, and edges: on bare walls edges alone would fit by chance. Or
+contrast, edges and sweeps the second."""
 _REFINED = 3
 """So many of these, the best, are refined if they gain."""
 _UNSEEN = 0.01
@@ -492,9 +493,12 @@ class _Candidate:
     sensor: str
     views: tuple[_View, ...]
     """Those that it concerns."""
+    given: Transform
+    """From the scanner to the vehicle; of maps the camera's."""
     gain: float = -math.inf
     by_contrast: float = 0.0
     by_edges: float = 0.0
+    by_sweeps: float = 0.0
     """Parts of it, before edges are cubed."""
     lack: float = 1.0
     before: float = 1.0
@@ -507,8 +511,12 @@ class _Candidate:
         """Whether it is named."""
         if not self.reading.both:
             return self.gain >= self.reading.clear and self.lack < _FITTING
-        gains = self.by_contrast >= _LEAST_GAINS[0] and self.by_edges >= _LEAST_GAINS[1]
-        return self.gain >= self.reading.clear and self.lack < min(_FITTING, _MOVES_SMALL * self.still) and gains
+        gains = self.by_contrast, self.by_edges, self.by_sweeps
+        told = any(
+            all(gain >= least for gain, least in zip(gains, asked, strict=False))
+            for asked in (_LEAST_GAINS, _LEAST_GAINS_WITH_SWEEPS)
+        )
+        return self.gain >= self.reading.clear and self.lack < min(_FITTING, _MOVES_SMALL * self.still) and told
 
 
 def _of_point_times(source: _Source) -> list[Reading]:
@@ -655,10 +663,11 @@ def _best(source: _Source, given: dict[_View, _Fit], apart_m: float | None, doub
         of_all = [*small("scanner"), *_of_point_times(source)]
         of_all += [*mountings("scanner"), *of_scans()] if doubt else []
     of_all += of_path() if doubt else []
-    tried = [_Candidate(reading, source.name, views) for reading in of_all]
+    to_vehicle = source.sweeps[0].to_vehicle if source.sweeps else views[0].camera.to_vehicle
+    tried = [_Candidate(reading, source.name, views, to_vehicle) for reading in of_all]
     for view in views:
         of_camera = [*small("camera"), *(mountings("camera") if doubt else [])]
-        tried += [_Candidate(reading, view.camera.name, (view,)) for reading in of_camera]
+        tried += [_Candidate(reading, view.camera.name, (view,), to_vehicle) for reading in of_camera]
     some = {view: view.pairs[1::3] or view.pairs for view in views}
     given_of_some = {view: source.fit(view, pairs, Reading()) for view, pairs in some.items()}
     first = [_tried(source, one, given_of_some, None, some) for one in tried]
@@ -705,7 +714,8 @@ def _tried(
     of_sweeps = candidate.sensor == source.name and not reading.scales
     if apart_m is not None and of_sweeps and gain > -0.2:
         other_m = source.apart_m(reading)
-        gain += 0.0 if other_m is None else _within(math.log(apart_m / other_m), _MOST_BY_SWEEPS)
+        parts["by_sweeps"] = 0.0 if other_m is None else _within(math.log(apart_m / other_m), _MOST_BY_SWEEPS)
+        gain += parts["by_sweeps"]
     return replace(candidate, gain=gain, lack=lack, before=before, still=still, **parts)
 
 
@@ -729,7 +739,7 @@ def _refined(source: _Source, best: _Candidate, given: dict[_View, _Fit], apart_
 
 
 def _said(best: Sequence[_Candidate]) -> str:
-    fits = ", and ".join(one.reading.said.replace("{name}", one.sensor) for one in best)
+    fits = ", and ".join(one.reading.said.replace("{name}", one.sensor) + _corrected(one) for one in best)
     then, given = (
         ", ".join(f"{1 - lack:.2f}" for lack in lacks)
         for lacks in zip(*((b.lack, b.before) for b in best), strict=True)
@@ -738,6 +748,16 @@ def _said(best: Sequence[_Candidate]) -> str:
         f"LiDAR does not lie on what the pictures show. It does if {fits} (contrast at its points agrees by {then} "
         f"then, by {given} as given)."
     )
+
+
+def _corrected(best: _Candidate) -> str:
+    """The transform to the vehicle that a small turn or offset of a sensor asks for."""
+    reading, (view, *_) = best.reading, best.views
+    if not reading.both or reading.scans_later_s or reading.pictures_later_s:
+        return ""
+    found = reading.camera(view.camera.to_vehicle) if best.sensor == view.camera.name else reading.scanner(best.given)
+    rows = ", ".join(f"[{', '.join(f'{number:.5g}' for number in row)}]" for row in found)
+    return f" (to_vehicle = [{rows}])"
 
 
 def _figures(source: _Source, view: _View, fit: _Fit, apart_m: float | None) -> LidarFigures:

@@ -18,10 +18,11 @@ from jaxtyping import Bool, Float64
 
 from edge_depth_nerf.base.files import read_image
 from edge_depth_nerf.base.numbers import spread_over
+from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.breaks import find_break
 from edge_depth_nerf.process.reading import read_if_whole
-from edge_depth_nerf.process.readings import of_path
+from edge_depth_nerf.process.readings import of_path, of_sensors
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 
 _FARTHEST_M = 50.0
@@ -53,10 +54,8 @@ def path_warnings(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h
         Sentences, and whether lengths are so wrong that nothing else can be told.
     """
     assert recording.trajectory is not None
-    mountings = [(camera.name, camera.to_vehicle) for camera in recording.cameras]
-    mountings += {sweep.scanner: sweep.to_vehicle for sweep in recording.sweeps}.items()
     found = []
-    for name, to_vehicle in mountings:
+    for name, to_vehicle in _mountings(recording):
         far_m = float(np.linalg.norm(to_vehicle[:3, 3]))
         if far_m > _FARTHEST_M:
             likely = f" Are they millimetres? {far_m / 1000:.2f} m would fit." if far_m / 1000 < _FARTHEST_M else ""
@@ -69,6 +68,12 @@ def path_warnings(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h
         return [*found, _stands(recording, path, reach_m, usable)], True
     misread = _misread(recording, path)
     return [*found, *(misread or _broken(path))], bool(found) or _speed(path) > _FASTEST_M_S
+
+
+def _mountings(recording: Recording) -> list[tuple[str, Transform]]:
+    """The scanners and the cameras, with their transforms to the vehicle."""
+    scanners = {sweep.scanner: sweep.to_vehicle for sweep in recording.sweeps}
+    return [*scanners.items(), *((camera.name, camera.to_vehicle) for camera in recording.cameras)]
 
 
 def _speed(path: Trajectory) -> float:
@@ -127,7 +132,7 @@ def _misread(recording: Recording, path: Trajectory) -> list[str]:
     if not faults:
         return []
     fits = []
-    for reading in of_path():
+    for reading in (*of_sensors(_mountings(recording)), *of_path()):
         assert reading.path is not None
         other = reading.path(path)
         plausible = _SLOWEST_M_S <= _speed(other) <= _FASTEST_M_S / 2 and _course(other) >= _GOOD_COURSE

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -132,7 +132,7 @@ def turn(sensor: str, axis: str) -> Callable[[float], Reading]:
     """Make readings that turn a "scanner" or a "camera" about an axis of its own, by degrees."""
 
     def by(degrees: float) -> Reading:
-        said = f"{{name}} is turned by {degrees:.1f}° about its {axis} axis: multiply to_vehicle by this from the right"
+        said = f"{{name}} is turned by {degrees:.1f}° about its {axis} axis"
         return replace(_mounting(sensor, said, _after(_turned(axis, degrees))), finer=by, amount=degrees)
 
     return by
@@ -144,7 +144,7 @@ def shift(sensor: str, axis: str) -> Callable[[float], Reading]:
     def by(metres: float) -> Reading:
         moved = np.eye(4)
         moved["xyz".index(axis), 3] = metres
-        said = f"{{name}} sits {metres:.2f} m further along its {axis} axis: multiply to_vehicle by this from the right"
+        said = f"{{name}} sits {metres:.2f} m further along its {axis} axis"
         return replace(_mounting(sensor, said, _after(moved)), finer=by, amount=metres)
 
     return by
@@ -228,6 +228,15 @@ def of_maps() -> list[Reading]:
         Reading("the depth maps of {name} hold distance: set kind", to_distance=as_distance),
         *(_longer(logarithm) for logarithm in _FACTORS),
     ]
+
+
+def of_sensors(mountings: Iterable[tuple[str, Transform]]) -> list[Reading]:
+    """The poses as those of a camera or a scanner; names of these, and their transforms to the vehicle."""
+
+    def as_of(to_vehicle: Transform) -> Callable[[Trajectory], Trajectory]:
+        return lambda path: Trajectory(path.times_s, path.vehicle_to_world @ np.linalg.inv(to_vehicle))
+
+    return [Reading(f'the poses are those of {name}: poses.of = "{name}"', path=as_of(to)) for name, to in mountings]
 
 
 def of_path() -> list[Reading]:

@@ -395,7 +395,8 @@ def _held_out(meta: dict[str, Any]) -> tuple[set[str], bool]:
 
 
 def _camera_name(frame: dict[str, Any]) -> str:
-    return frame["camera"] if "camera" in frame else Path(frame["file_path"]).parent.as_posix()
+    folder = Path(frame["file_path"]).parent
+    return frame.get("camera", folder.as_posix() if folder.name else "camera")
 
 
 def _frame_numbers(frames: list[dict[str, Any]]) -> dict[str, int]:
