@@ -24,7 +24,7 @@ def test_a_scene_without_depth_maps_is_trained_as_plain_nerfacto(tmp_path, capsy
     pipeline = pipeline_of(scene)
     assert (
         "no depth maps" in (said := " ".join(capsys.readouterr().out.split()))
-        and "nerfacto without a depth loss" in said
+        and "this is nerfacto without" in said
     )
     losses = pipeline.get_train_loss_dict(0)[1]
     assert np.isfinite(float(losses["rgb_loss"].detach())) and not any("depth" in name for name in losses)
