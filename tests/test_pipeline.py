@@ -22,10 +22,7 @@ def test_a_depth_loss_without_any_prior_is_an_error(tmp_path):
 def test_a_scene_without_depth_maps_is_trained_as_plain_nerfacto(tmp_path, capsys):
     scene = write_scene(tmp_path, lidar=False, mono=False)
     pipeline = pipeline_of(scene)
-    assert (
-        "no depth maps" in (said := " ".join(capsys.readouterr().out.split()))
-        and "this is nerfacto without" in said
-    )
+    assert "no depth maps" in (said := " ".join(capsys.readouterr().out.split())) and "this is nerfacto without" in said
     losses = pipeline.get_train_loss_dict(0)[1]
     assert np.isfinite(float(losses["rgb_loss"].detach())) and not any("depth" in name for name in losses)
     with pytest.raises(InputError, match="the scene has no LiDAR maps, but depth_source lidar needs them"):
