@@ -6,7 +6,7 @@ Host-facing. Masks and metrics of whole views are those of `ns-eval`, the same f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
