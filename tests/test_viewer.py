@@ -458,7 +458,8 @@ def training(tmp_path_factory) -> Iterator[SimpleNamespace]:
 def test_pausing_a_training_asks_for_a_picture_with_detail(training, monkeypatch, switched_on):
     layers, asked = training.trainer.pipeline.drive.layers, []
     monkeypatch.setattr(Viewer, "_trigger_rerender", lambda viewer: asked.append(viewer))
-    monkeypatch.setattr(layers.detail, "value", switched_on)
+    # the switch itself would ask, too, from a thread of its own
+    monkeypatch.setattr(layers, "detail", SimpleNamespace(value=switched_on))
     ours = [each for each in training.viewer.pause_train._impl.update_cb if each.__module__ == layers.__module__]
     assert len(ours) == 1
     ours[0](None)
