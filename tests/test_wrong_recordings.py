@@ -24,6 +24,7 @@ from edge_depth_nerf.process.lidar_checks import LidarCheck, check_lidar
 from edge_depth_nerf.process.mask_checks import mask_warnings
 from edge_depth_nerf.process.options import RigOptions
 from edge_depth_nerf.process.path_checks import path_warnings
+from edge_depth_nerf.process.readings import Reading
 from edge_depth_nerf.process.recording import DepthFile, Recording
 from edge_depth_nerf.process.rig import read_rig_recording
 from edge_depth_nerf.synthetic.drive import synthesize_drive
@@ -171,6 +172,18 @@ def test_noisy_pictures_name_small_faults(
     assert len(found.warnings) == (said is not None)
     assert said is None or re.search(said, found.warnings[0]), found.warnings
     assert said is not None or found.figures[0].correlation < 0.85
+
+
+@pytest.mark.parametrize(
+    ("by_contrast", "by_edges", "by_sweeps", "clear"),
+    [(0.3, 0.05, 0.0, True), (0.1, 0.05, 0.5, True), (0.1, 0.05, 0.0, False), (0.1, 0.0, 0.5, False)],
+)
+def test_a_small_fault_is_told_by_contrast_and_edges_or_with_sweeps(
+    by_contrast: float, by_edges: float, by_sweeps: float, clear: bool
+) -> None:
+    gains = {"by_contrast": by_contrast, "by_edges": by_edges, "by_sweeps": by_sweeps}
+    reading = Reading(both=True, clear=0.2)
+    assert lidar_checks._Candidate(reading, "roof", (), np.eye(4), 1.0, **gains, lack=0.1, still=0.5).clear is clear
 
 
 def test_point_times_that_count_backwards_are_named(recording: Recording) -> None:
