@@ -128,12 +128,24 @@ def write_street(folder: Path, frames: int = 10, seed: int = 0, lidar: bool = Tr
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory) -> Path:
-    return write_street(tmp_path_factory.mktemp("street"), frames=26)
+    return write_street(tmp_path_factory.mktemp("street"), frames=18)
+
+
+@pytest.fixture(scope="module")
+def ten_frames(tmp_path_factory) -> Path:
+    return write_street(tmp_path_factory.mktemp("ten") / "street")
 
 
 @pytest.fixture
-def small_street(tmp_path) -> Path:
-    return write_street(tmp_path / "street")
+def small_street(ten_frames, tmp_path) -> Path:
+    return Path(shutil.copytree(ten_frames, tmp_path / "street"))
+
+
+@pytest.fixture
+def tiny_preset(monkeypatch) -> None:
+    """For commands whose network is of no matter."""
+    values = dataclasses.replace(PRESETS["lite"], channels=TINY.channels, working_px=TINY.working_px)
+    monkeypatch.setitem(PRESETS, "lite", values)
 
 
 def examples_of(scene: Path, held_out: bool = False) -> Examples:
@@ -275,7 +287,7 @@ def test_it_learns_what_colours_mean(street):
     settings = dataclasses.replace(TINY, working_px=40, channels=(8, 16, 32))
     pictures = [picture for picture in scene.pictures if not picture.held_out]
     examples = load_examples([scene], [pictures], [{"front": HEIGHT_M}], 40, settings.multiple_px)
-    trained = train(examples, None, settings, TrainingOptions(steps=400, learning_rate=5e-3))
+    trained = train(examples, None, settings, TrainingOptions(steps=160, learning_rate=1e-2))
     room = DepthNetwork(settings)
     logs = np.log(examples.lidar_m[examples.lidar_m > 0])
     errors: dict[str, list[np.ndarray]] = {"network": [], "room": [], "constant": []}
@@ -402,6 +414,7 @@ def test_what_is_kept_for_stopping_are_whole_training_frames(tmp_path):
 
 
 # ---- the command -----------------------------------------------------------------------------------------------
+@pytest.mark.usefixtures("tiny_preset")
 def test_held_out_pictures_have_no_say_and_the_command_continues(small_street, tmp_path):
     other = tmp_path / "other"
     shutil.copytree(small_street, other)
@@ -492,6 +505,7 @@ def said_by(options: EstimateDepthOptions) -> str:
     return console.file.getvalue()
 
 
+@pytest.mark.usefixtures("tiny_preset")
 @pytest.mark.parametrize("content", ["broken", "older", "header"])
 def test_weights_in_the_scene_that_are_of_no_use_are_made_anew(small_street, content):
     path = small_street / WEIGHTS
@@ -505,6 +519,7 @@ def test_weights_in_the_scene_that_are_of_no_use_are_made_anew(small_street, con
     assert load_network(path)[1]["steps"] == 1
 
 
+@pytest.mark.usefixtures("tiny_preset")
 def test_no_file_of_others_is_overwritten(small_street, tmp_path):
     path = tmp_path / "theirs.safetensors"
     options = EstimateDepthOptions((small_street,), train_steps=1, output=path)
@@ -534,6 +549,7 @@ def test_training_never_writes_over_the_weights_it_starts_from(small_street, tmp
     assert path.read_bytes() == before
 
 
+@pytest.mark.usefixtures("tiny_preset")
 def test_pictures_kept_for_stopping_without_points(small_street):
     # frame 5 is kept
     write_distance_png(small_street / "lidar" / "0005.png", np.zeros((LENS.height, LENS.width)))
@@ -543,6 +559,7 @@ def test_pictures_kept_for_stopping_without_points(small_street):
     assert about["steps"] == 2 and about["abs_rel"] is None
 
 
+@pytest.mark.usefixtures("tiny_preset")
 def test_scenes_of_one_name_keep_their_own_trained_frames(tmp_path):
     one = write_street(tmp_path / "a" / "scene", frames=10, seed=1)
     other = write_street(tmp_path / "b" / "scene", frames=4, seed=2)
@@ -559,6 +576,7 @@ def test_scenes_of_one_name_keep_their_own_trained_frames(tmp_path):
     assert frames(unseen) == []
 
 
+@pytest.mark.usefixtures("tiny_preset")
 def test_the_field_of_the_training_points_goes_with_weights_and_maps(tmp_path):
     low, high = (write_street(tmp_path / name, seed=seed) for seed, name in enumerate(("low", "high")))
     expected = []
