@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -70,7 +71,7 @@ def copied(output: Path, folder: Path) -> Path:
 
 def write_compared_scene(folder: Path) -> Path:
     """A small scene that has all that is compared: two held-out views, and true ones beside the first of them."""
-    camera = fisheye(44, 40)
+    camera = fisheye(30, 26)
     meta = read_json(write_scene(folder, [camera], frames=13) / "transforms.json")
     for frame in meta["frames"]:
         frame["camera"] = "only"
@@ -88,6 +89,14 @@ def write_compared_scene(folder: Path) -> Path:
         meta["shifted_views"][str(metres)] = [entry]
     write_json(folder / "transforms.json", meta)
     return folder
+
+
+def run_here(runs: Sequence[Any], *_: object) -> None:
+    """Train and evaluate as a comparison's processes do, in this one, which has imported nerfstudio already."""
+    from edge_depth_nerf.compare.worker import do_run
+
+    for run in runs:
+        do_run(run.folder.absolute())
 
 
 def write_rendered(scene: Path, folder: Path, gain: float) -> None:

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
-from comparisons import QUIET, copied, options, write_compared_scene
+from comparisons import QUIET, copied, options, run_here, write_compared_scene
 from nerfstudio.utils.eval_utils import eval_setup
 from numba import njit
 from numba.core.event import install_listener
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("compare")
     scene, both = write_compared_scene(folder / "sample"), ("nerfacto", "edge")
-    asked = options(scene, output=folder / "out", methods=both, steps=12, jobs=2, detail=True)
+    asked = options(scene, output=folder / "out", methods=both, steps=6, jobs=2, detail=True)
     return asked, command.compare(asked, QUIET)
 
 
@@ -76,10 +76,10 @@ def test_it_leaves_figures_tables_and_pictures(finished):
         assert all(any(f"stroke: {colour}" in style for style in styles) for colour in ("#888888", "#d62828"))
     for run in results.runs:
         assert run.content["mono_trained_on"] == "scene"
-        # twelve steps render a blur: the pictures around a view show more
+        # six steps render a blur: the pictures around a view show more
         assert run.figures["detail_truth_masked_psnr"] > run.figures["truth_masked_psnr"] + 1
         assert len([*(run.folder / "views").glob("eval_detail_*.png")]) == 2
-        assert [point["step"] for point in run.curve][-1] == 12
+        assert [point["step"] for point in run.curve][-1] == 6
         assert all(math.isfinite(point["trained_psnr"]) for point in run.curve)
         seconds = [point["seconds"] for point in run.curve]
         assert seconds == sorted(seconds) and seconds[0] > 0
@@ -144,6 +144,7 @@ def test_runs_of_which_only_the_figures_are_left_count_in_the_tables(finished, t
                 continue
             shutil.rmtree(each) if each.is_dir() else each.unlink()
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("started a command"))
+    monkeypatch.setattr(command, "draw_plots", lambda *_: [])
     assert command.compare(replace(asked, output=output), QUIET).rows() == results.rows()
     assert "| nerfacto |" in (output / "tables.md").read_text()
     assert (output / "comparison_sample.png").is_file() == bool(kept)
@@ -152,23 +153,25 @@ def test_runs_of_which_only_the_figures_are_left_count_in_the_tables(finished, t
     assert page.count('"distance-error": "data:image/webp') == 2 * len(kept)
 
 
-def test_an_interrupted_run_goes_on_at_its_checkpoint(finished, tmp_path):
-    """As if it had been killed after four of ours' twelve steps."""
+def test_an_interrupted_run_goes_on_at_its_checkpoint(finished, tmp_path, monkeypatch):
+    """As if it had been killed after four of ours' six steps."""
     asked, results = finished
     output = tmp_path / "out"
     copied(asked.output, output)
     folder = output / "runs" / "sample" / "edge_seed-0"
     (folder / "figures.json").unlink()
     checkpoints = next(folder.rglob("nerfstudio_models"))
-    saved = torch.load(checkpoints / "step-000000011.ckpt", weights_only=True)
-    (checkpoints / "step-000000011.ckpt").unlink()
+    saved = torch.load(checkpoints / "step-000000005.ckpt", weights_only=True)
+    (checkpoints / "step-000000005.ckpt").unlink()
     torch.save({**saved, "step": 3}, checkpoints / "step-000000003.ckpt")
     progress = read_json(folder / "progress.json")
     progress["times"] = {"4": {"seconds": 100.0, "cpu_seconds": 50.0}}
     write_json(folder / "progress.json", progress)
+    monkeypatch.setattr(command, "do_runs", run_here)
+    monkeypatch.setattr(command, "draw_plots", lambda *_: [])
     again = command.compare(replace(asked, output=output), QUIET)
     before, after = (next(run for run in found.runs if run.method == "edge") for found in (results, again))
-    assert [path.name for path in checkpoints.iterdir()] == ["step-000000011.ckpt"]
+    assert [path.name for path in checkpoints.iterdir()] == ["step-000000005.ckpt"]
     steps = [point["step"] for point in before.curve]
     assert [point["step"] for point in after.curve] == steps
     assert after.curve[: steps.index(4.0) + 1] == before.curve[: steps.index(4.0) + 1]
