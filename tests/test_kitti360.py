@@ -78,7 +78,7 @@ STEP_M = 1 / 256
 def process(drive: RoomDrive | Path, output: Path, **options: Any) -> ProcessReport:
     root = drive if isinstance(drive, Path) else drive.root
     console = options.pop("console", Console(quiet=True))
-    given = {"root": root, "sequence": SEQUENCE, "output": output, "sweeps": 0, "strict": True}
+    given = {"root": root, "sequence": SEQUENCE, "output": output, "sweeps": 0, "strict": True, "refine_poses": False}
     return convert(Kitti360Options(**given | options), console)
 
 
@@ -101,9 +101,14 @@ def scene(room: RoomDrive) -> Path:
     return output
 
 
+@pytest.fixture(scope="module")
+def three_frames(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
+    return write_room_drive(tmp_path_factory.mktemp("three") / "drive", frames=3, beams=300, size=32)
+
+
 @pytest.fixture
-def drive(tmp_path: Path) -> RoomDrive:
-    return write_room_drive(tmp_path / "drive", frames=3, beams=300, size=32)
+def drive(three_frames: RoomDrive, tmp_path: Path) -> RoomDrive:
+    return replace(three_frames, root=shutil.copytree(three_frames.root, tmp_path / "drive"))
 
 
 def maps(scene: Path, key: str) -> dict[tuple[str, int], np.ndarray]:
