@@ -22,8 +22,10 @@ from edge_depth_nerf.lidar.world import WorldSweep, sweep_in_world
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.moving import clearest_edge, grow_moving
 from edge_depth_nerf.process.converters import convert, read_drive
-from edge_depth_nerf.process.moving import MOVING_MASKS, find_moving
+from edge_depth_nerf.process.moving import MOVING_MASKS, find_moving, moving_mask_path
 from edge_depth_nerf.process.options import RigOptions
+from edge_depth_nerf.process.recording import Recording
+from edge_depth_nerf.process.vehicle import vehicle_masks
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
@@ -207,13 +209,27 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def options(root: Path, output: Path, **more: object) -> RigOptions:
-    return RigOptions(root=root, output=output, estimate_depth=False, find_moving=True, **more)  # pyright: ignore
+    given = {"find_moving": True, "refine_poses": False, "sweeps": 0, **more}
+    return RigOptions(root=root, output=output, **given)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.fixture(scope="module")
+def processed(drive: Path) -> Path:
+    """Its scene, where frames 4 and 12 are held out."""
+    report = convert(options(drive, drive.parent / "scene"))
+    assert any(MOVING_MASKS in notice for notice in report.notices)
+    return report.scene
+
+
+def found_again(recording: Recording, wanted: RigOptions) -> Recording:
+    return find_moving(recording, wanted, {4, 12}, vehicle_masks(recording), Console(quiet=True))[0]
 
 
 @pytest.mark.slow
-def test_what_moves_in_a_drive_is_masked_and_masks_can_be_corrected(drive: Path, tmp_path: Path) -> None:
-    report = convert(options(drive, tmp_path / "scene"))
-    assert any(MOVING_MASKS in notice for notice in report.notices)
+def test_what_moves_in_a_drive_is_masked_and_masks_can_be_corrected(
+    drive: Path, processed: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(processed, tmp_path / "scene")
     recording = read_drive(options(drive, tmp_path / "scene"))
     counts = np.zeros(4)
     for picture in recording.pictures:
@@ -241,38 +257,41 @@ def test_what_moves_in_a_drive_is_masked_and_masks_can_be_corrected(drive: Path,
 
 
 @pytest.mark.slow
-def test_training_pictures_know_nothing_of_sweeps_that_are_held_out(drive: Path, tmp_path: Path) -> None:
+def test_training_pictures_know_nothing_of_sweeps_that_are_held_out(
+    drive: Path, processed: Path, tmp_path: Path
+) -> None:
+    wanted = options(drive, tmp_path / "without", cameras=("left",))
+    recording = read_drive(wanted)
+    kept = tuple(sweep for sweep in recording.sweeps if sweep.frame not in (4, 12))
+    assert len(kept) < len(recording.sweeps)
+    found = found_again(dataclasses.replace(recording, sweeps=kept), wanted)
     masks = []
-    for name in ("with", "without"):
-        wanted = options(drive, tmp_path / name)
-        recording = read_drive(wanted)
-        if name == "without":
-            kept = tuple(sweep for sweep in recording.sweeps if sweep.frame not in (4, 12))
-            assert len(kept) < len(recording.sweeps)
-            recording = dataclasses.replace(recording, sweeps=kept)
-        found, _ = find_moving(recording, wanted, {4, 12}, {}, Console(quiet=True))
-        paths = [picture.moving_mask for picture in found.pictures if picture.frame not in (4, 12)]
-        masks.append([read_mask(path) for path in paths if path is not None])
-    assert sum((~mask).sum() for mask in masks[0]) > 100
-    assert all(np.array_equal(a, b) for a, b in zip(*masks, strict=True))
+    for picture in found.pictures:
+        if picture.frame not in (4, 12):
+            with_them = moving_mask_path(processed, picture)
+            assert picture.moving_mask is not None and picture.moving_mask != with_them
+            masks.append((read_mask(with_them), read_mask(picture.moving_mask)))
+    assert sum((~mask).sum() for mask, _ in masks) > 100
+    assert all(np.array_equal(*each) for each in masks)
 
 
 @pytest.mark.slow
-def test_a_picture_that_is_damaged_gets_no_mask(drive: Path, tmp_path: Path) -> None:
+def test_a_picture_that_is_damaged_gets_no_mask(drive: Path, processed: Path, tmp_path: Path) -> None:
     root = Path(shutil.copytree(drive, tmp_path / "drive"))
-    wanted = options(root, tmp_path / "scene")
+    wanted = options(root, tmp_path / "scene", cameras=("left",))
     recording = read_drive(wanted)
-    whole, _ = find_moving(recording, wanted, {4, 12}, {}, Console(quiet=True))
-    hidden = [picture for picture in whole.pictures if not read_mask(picture.moving_mask).all()]  # pyright: ignore
-    assert hidden and hidden[0].moving_mask is not None
-    hidden[0].moving_mask.unlink()
-    content = bytearray(hidden[0].path.read_bytes())
+    shutil.copytree(processed / MOVING_MASKS, wanted.output / MOVING_MASKS)
+    paths = {picture.path: moving_mask_path(wanted.output, picture) for picture in recording.pictures}
+    hidden = [path for path, mask in paths.items() if not read_mask(mask).all()]
+    assert hidden
+    paths[hidden[0]].unlink()
+    content = bytearray(hidden[0].read_bytes())
     content[len(content) // 2] ^= 0x5A
-    hidden[0].path.write_bytes(content)
-    found, _ = find_moving(recording, wanted, {4, 12}, {}, Console(quiet=True))
-    assert [picture.path for picture in found.pictures if picture.moving_mask is None] == [hidden[0].path]
-    with pytest.raises(InputError, match=hidden[0].path.name):
-        find_moving(recording, dataclasses.replace(wanted, strict=True), {4, 12}, {}, Console(quiet=True))
+    hidden[0].write_bytes(content)
+    found = found_again(recording, wanted)
+    assert [picture.path for picture in found.pictures if picture.moving_mask is None] == [hidden[0]]
+    with pytest.raises(InputError, match=hidden[0].name):
+        found_again(recording, dataclasses.replace(wanted, strict=True))
 
 
 @pytest.mark.slow
