@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -23,12 +23,14 @@ from waiting import until
 from edge_depth_nerf import cli
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json
+from edge_depth_nerf.compare import command as comparing
 from edge_depth_nerf.compare.command import compare
 from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.jobs import cluster
 from edge_depth_nerf.jobs.cluster import on_cluster
 from edge_depth_nerf.jobs.cluster_address import check_address
 from edge_depth_nerf.jobs.tasks import Task, do_tasks, own_command
+from edge_depth_nerf.mono import many
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.many import estimate_on_cluster
 from edge_depth_nerf.mono.options import EstimateDepthOptions
@@ -289,7 +291,7 @@ def test_a_command_line_gives_the_options_back(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
-    drive = write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=10, beams=800, size=48)
+    drive = write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=10, beams=800, size=32)
     # a frame without pose, one without sweep
     poses = drive.poses_file().read_text().splitlines()
     drive.poses_file().write_text("\n".join([*poses[:3], *poses[4:]]) + "\n")
@@ -299,11 +301,12 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
 
 def options_of(room: RoomDrive, output: Path, **changes: Any) -> Kitti360Options:
     given: dict[str, Any] = {"root": room.root, "sequence": SEQUENCE, "output": output, "sweeps": 1, "find_ego": False}
-    return Kitti360Options(**{**given, "estimate_depth": False, **changes})
+    given |= {"refine_poses": False, "motion": False, "estimate_depth": False}
+    return Kitti360Options(**{**given, **changes})
 
 
 @pytest.mark.slow
-def test_a_drive_is_cut_as_by_hand(room: RoomDrive, tmp_path: Path) -> None:
+def test_a_drive_is_cut_as_by_hand(room: RoomDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Eight frames of ten can be used: 1, 2, 4 to 9."""
     by_hand = {"000": (1, 5), "001": (6, 4)}
     for name, (first, frames) in by_hand.items():
@@ -327,7 +330,18 @@ def test_a_drive_is_cut_as_by_hand(room: RoomDrive, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is a scene; --frames-per-scene would write other scenes into it"):
         process_drive(options_of(room, tmp_path / "here" / "000", frames_per_scene=5), QUIET)
 
-    # the scenes' maps: of one network, trained by one task
+    # the scenes' maps: of one network, trained by one task; each task does its words, as the scenes' did above
+    did: list[str] = []
+
+    def do(_: Any, tasks: Sequence[Task], *__: Any) -> None:
+        for task in tasks:
+            assert task.arguments[:3] == ("-m", "edge_depth_nerf", "--end-with-parent")
+            cli.run(cli.parse([*task.arguments[3:]]))
+            assert task.makes.is_file()
+            did.append(task.title)
+
+    monkeypatch.setattr(many, "_do", do)
+
     def weights(folder: Path) -> bytes:
         return (folder / "000" / "mono_network.safetensors").read_bytes()
 
@@ -338,16 +352,17 @@ def test_a_drive_is_cut_as_by_hand(room: RoomDrive, tmp_path: Path) -> None:
     here, there = files_of(tmp_path / "here"), files_of(tmp_path / "there")
     assert len([name for name in there if "/mono/" in name]) == 2 * 8
     assert there == here
-    assert (tmp_path / "there/000/mono_network.log").read_text().count("$ ") == 1
+    assert did == ["depth network", *(f"maps of {path}" for path in scenes["there"])]
 
 
 @pytest.mark.slow
-def test_a_comparison_goes_on_when_a_worker_is_killed(tmp_path: Path) -> None:
+def test_a_comparison_goes_on_when_a_worker_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_compared_scene(tmp_path / "sample")
     output = tmp_path / "out"
-    asked = CompareOptions(scenes=(tmp_path / "sample",), output=output, methods=("edge",), steps=8, cluster="local")
+    asked = CompareOptions(scenes=(tmp_path / "sample",), output=output, methods=("edge",), steps=2, cluster="local")
+    monkeypatch.setattr(comparing, "draw_plots", lambda *_: [])
     folder = output / "runs" / "sample" / "edge_seed-0"
-    killer = kill_worker_of(str(folder), lambda: list(folder.rglob("nerfstudio_models/step-000000007.ckpt")))
+    killer = kill_worker_of(str(folder), lambda: list(folder.rglob("nerfstudio_models/step-000000001.ckpt")))
     console = Console(file=io.StringIO(), width=200)
     results = compare(asked, console)
     killer.join()
@@ -356,7 +371,7 @@ def test_a_comparison_goes_on_when_a_worker_is_killed(tmp_path: Path) -> None:
     said = (folder / "run.log").read_text()
     first, second = said.split("$ ")[1:]
     assert "No Nerfstudio checkpoint to load" in first and "Done loading Nerfstudio checkpoint" in second
-    assert list(read_json(folder / "progress.json")["times"]) == ["8"]
+    assert list(read_json(folder / "progress.json")["times"]) == ["2"]
     # what is done is done: the same tables come from the same command without a cluster
     tables = (output / "tables.md").read_text()
     compare(replace(asked, cluster=None), QUIET)
