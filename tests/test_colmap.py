@@ -601,9 +601,9 @@ def five_frames(drive: Path, folder: Path, noise: int) -> tuple[Recording, Kitti
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [2, 3, 5, 7])
+@pytest.mark.parametrize("noise", [2, 7])
 def test_five_frames_are_enough(drive, tmp_path, noise):
-    """With COLMAP's own demands on a picture all four of these end with a model of two pictures."""
+    """With COLMAP's own demands on a picture both of these end with a model of two pictures."""
     pytest.importorskip("pycolmap")
     found = colmap_poses(*five_frames(drive, tmp_path, noise), QUIET)
     assert found.trajectory is not None
