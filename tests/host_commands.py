@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-TIMEOUT_S = 480
+TIMEOUT_S = 960
 
 
 def status_of(words: list[str]) -> int:
