@@ -30,8 +30,8 @@ def test_evaluation_leaves_no_trace_in_a_training(tmp_path):
     pipeline = pipeline_of(write_scene(tmp_path), depth_loss="edge", num_proposal_samples_per_ray=(8, 8))
     pipeline.datamanager.train_pixel_sampler.num_rays_per_batch = 32
     start = deepcopy(pipeline.state_dict())
-    chosen = choose_pixels(pipeline.datamanager.eval_dataset)
-    trained_on = choose_pixels(pipeline.datamanager.train_dataset)
+    chosen = choose_pixels(pipeline.datamanager.eval_dataset, most=200)
+    trained_on = choose_pixels(pipeline.datamanager.train_dataset, most=200)
     ends, figures, of_trained = [], [], []
     for evaluating in (False, True):
         pipeline.load_state_dict(start)

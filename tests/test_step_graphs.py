@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from scenes import write_scene
+from scenes import fisheye, write_scene
 from torch.utils._pytree import tree_leaves
 from trainings import trainer_of
 
@@ -170,18 +170,23 @@ def assert_same(
     assert rates[0] == rates[1] and all(isinstance(rate, float) for rate in rates[1])
 
 
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"), [fisheye(24, 20)])
+
+
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(step_graphs, "RECORD_AT", RECORD_AT)
-    write_scene(tmp_path / "scene")
+    (tmp_path / "scene").symlink_to(scene)
     return tmp_path
 
 
 @pytest.fixture(scope="module")
-def computed(tmp_path_factory: pytest.TempPathFactory) -> tuple[EdgeDepthTrainer, list[dict[str, float]]]:
+def computed(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[EdgeDepthTrainer, list[dict[str, float]]]:
     """A training step by step, and its losses."""
     folder = tmp_path_factory.mktemp("computed")
-    write_scene(folder / "scene")
+    (folder / "scene").symlink_to(scene)
     trainer = never_recorded(trainer_in(folder, "run"))
     return trainer, losses_of(trainer, range(STEPS))
 
