@@ -1,6 +1,7 @@
 """Monocular maps by file: formats, units, z and distance, unknown scale, and everything that can be wrong with them."""
 
 import dataclasses
+import shutil
 import struct
 import sys
 from pathlib import Path
@@ -59,14 +60,19 @@ def error(scene: Path) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("written") / "scene", [LENS], mono=False)
+
+
 @pytest.fixture
-def scene(tmp_path) -> Path:
-    return write_scene(tmp_path / "scene", [LENS], mono=False)
+def scene(written, tmp_path) -> Path:
+    return Path(shutil.copytree(written, tmp_path / "scene"))
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, ">f8"])
-def test_metric_distances_are_taken_as_they_are(scene, tmp_path, dtype):
-    maps = write_maps(scene, tmp_path / "maps", lambda picture, distance, cosine: distance.astype(dtype))
+def test_metric_distances_are_taken_as_they_are(scene, tmp_path):
+    types = (np.float16, np.float32, ">f8")
+    maps = write_maps(scene, tmp_path / "maps", lambda picture, d, c: d.astype(types[picture.frame % 3]))
     before = read_json(scene / "transforms.json")
     take(scene, maps)
     assert error(scene).max() < 2e-3
@@ -126,8 +132,7 @@ def test_z_needs_the_cameras_intrinsics(scene, tmp_path):
         take(scene, maps, along="z")
 
 
-@pytest.mark.parametrize("along", ["ray", "z"])
-@pytest.mark.parametrize("kind", ["relative", "inverse"])
+@pytest.mark.parametrize(("kind", "along"), [("relative", "z"), ("inverse", "ray")])
 def test_maps_of_unknown_scale_are_fitted_to_the_frames_own_lidar(scene, tmp_path, kind, along):
     def make(picture, distance, cosine):
         rng = np.random.default_rng(picture.frame)
@@ -201,8 +206,7 @@ def test_values_that_are_no_distance_are_none(scene, tmp_path):
         assert (written[20, 20 : 20 + len(bad)] == 0).all() and (written[18, 20 : 20 + len(bad)] > 0).all()
 
 
-@pytest.mark.parametrize("fill", [0.0, np.nan, np.inf, -1.0])
-@pytest.mark.parametrize("which", ["one", "every"])
+@pytest.mark.parametrize(("which", "fill"), [("one", 0.0), ("every", np.nan), ("one", np.inf), ("every", -1.0)])
 def test_a_map_without_a_distance_is_named_and_nothing_is_written(scene, tmp_path, fill, which):
     maps = write_maps(scene, tmp_path / "maps", lambda p, d, c: np.full_like(d, fill) if which == "every" else d)
     np.save(maps / "images/0005.npy", np.full((44, 48), fill))
@@ -226,29 +230,29 @@ def header_of(shape: str, dtype: str = "<f4") -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
 
 
-@pytest.mark.parametrize(
-    ("content", "expected"),
-    [
-        (header_of("(44, 48)") + bytes(100), r"truncated: 100 bytes of numbers for a shape of \(44, 48\)"),
-        (header_of("(4400000, 4800000)") + bytes(100), "truncated"),
-        (header_of("(44, 48)", "|O") + bytes(9000), "holds object, expected float16"),
-        (header_of("(44, 48)", "<i4") + bytes(9000), "holds int32, expected float16"),
-        (header_of("(44, 48, 3)") + bytes(99000), r"its shape is \(44, 48, 3\), expected height × width"),
-        (header_of("(2112,)") + bytes(9000), r"its shape is \(2112,\)"),
-        (header_of("(0, 48)") + bytes(9000), r"its shape is \(0, 48\)"),
-        (header_of("(48, 44)") + bytes(8448), "is 44×48 .width × height., its picture images/0003.png 48×44"),
-        (b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65535, "cannot be read as an array"),
-        (b"PK\x03\x04" + bytes(500), "cannot be read as an array"),
-        (b"", "cannot be read as an array"),
-    ],
-)
-def test_broken_arrays_are_named_before_any_work(scene, tmp_path, content, expected):
+BROKEN_ARRAYS = [
+    (header_of("(44, 48)") + bytes(100), r"truncated: 100 bytes of numbers for a shape of \(44, 48\)"),
+    (header_of("(4400000, 4800000)") + bytes(100), "truncated"),
+    (header_of("(44, 48)", "|O") + bytes(9000), "holds object, expected float16"),
+    (header_of("(44, 48)", "<i4") + bytes(9000), "holds int32, expected float16"),
+    (header_of("(44, 48, 3)") + bytes(99000), r"its shape is \(44, 48, 3\), expected height × width"),
+    (header_of("(2112,)") + bytes(9000), r"its shape is \(2112,\)"),
+    (header_of("(0, 48)") + bytes(9000), r"its shape is \(0, 48\)"),
+    (header_of("(48, 44)") + bytes(8448), "is 44×48 .width × height., its picture images/0003.png 48×44"),
+    (b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 65535, "cannot be read as an array"),
+    (b"PK\x03\x04" + bytes(500), "cannot be read as an array"),
+    (b"", "cannot be read as an array"),
+]
+
+
+def test_broken_arrays_are_named_before_any_work(scene, tmp_path):
     maps = write_maps(scene, tmp_path / "maps", lambda p, d, c: d)
-    (maps / "images/0003.npy").write_bytes(content)
     # read first, were the headers not looked at before
     np.save(maps / "images/0000.npy", np.zeros((44, 48)))
-    with pytest.raises(InputError, match=rf"0003.npy: .*{expected}"):
-        take(scene, maps)
+    for content, expected in BROKEN_ARRAYS:
+        (maps / "images/0003.npy").write_bytes(content)
+        with pytest.raises(InputError, match=rf"0003.npy: .*{expected}"):
+            take(scene, maps)
 
 
 def test_broken_pngs_are_named_before_any_work(scene, tmp_path):
