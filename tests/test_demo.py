@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from comparisons import copied, fake, write_rendered
+from comparisons import copied, fake, run_here, write_rendered
 from drives import SEQUENCE, write_room_drive
 from rich.console import Console
 
@@ -25,7 +25,9 @@ from edge_depth_nerf.demo import command as demo
 from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.demo.recording import options_of
 from edge_depth_nerf.mono import estimate
+from edge_depth_nerf.process import build
 from edge_depth_nerf.process.converters import convert
+from edge_depth_nerf.process.lidar_checks import LidarCheck
 from edge_depth_nerf.process.options import Kitti360Options, RigOptions
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
@@ -43,9 +45,11 @@ SHOWN = {
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    options = DemoOptions(output=tmp_path_factory.mktemp("demo") / "out", frames=13, size=64, steps=8)
+    options = DemoOptions(output=tmp_path_factory.mktemp("demo") / "out", frames=13, size=32, steps=4)
     lite = estimate.PRESETS["lite"]
     with pytest.MonkeyPatch.context() as patch:
+        # a process for each training is seen in test_compare_worker.py
+        patch.setattr(comparing, "do_runs", run_here)
         patch.setitem(estimate.PRESETS, "lite", replace(lite, training=replace(lite.training, steps=20)))
         return options, demo.run_demo(options, QUIET)
 
@@ -68,7 +72,7 @@ def test_it_leaves_figures_and_a_picture(finished):
     # one of distances, of three pictures 220 px wide
     assert picture.shape == (34 + 6 * 226 - 6 + 40, 3 * 226 - 6, 3), "with the scale of distances below"
     page = (options.output / "report.html").read_text(encoding="utf-8")
-    assert "<h1>Demo: nerfacto and ours on a rendered street</h1>" in page and "for 8 steps each" in page
+    assert "<h1>Demo: nerfacto and ours on a rendered street</h1>" in page and "for 4 steps each" in page
     assert '<p class="verdict">Ours renders held-out pictures ' in page and " than nerfacto (PSNR" in page
     assert "Table 1</i> Rivals" in page and "All 4 held-out views" in page
     for name, form in SHOWN.items():
@@ -124,6 +128,7 @@ def test_an_interrupted_demo_is_finished(finished, tmp_path, monkeypatch):
         for path in runs_of(output).rglob(name):
             path.write_text(path.read_text().replace(str(options.output), str(output)))
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("started a command"))
+    monkeypatch.setattr(comparing, "draw_plots", lambda *_: [])
     found = demo.run_demo(replace(options, output=output), QUIET)
     assert found["figures"] == results["figures"]
     assert found["seconds"]["compare"] > results["seconds"]["compare"]
@@ -132,7 +137,7 @@ def test_an_interrupted_demo_is_finished(finished, tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("recorded") / "my drive"
-    synthesize_drive(SynthesizeOptions(output=root, layout="rig", scene="parking", frames=14, size=48))
+    synthesize_drive(SynthesizeOptions(output=root, layout="rig", scene="parking", frames=14, size=32))
     return root
 
 
@@ -148,6 +153,9 @@ def test_a_recording_of_ones_own(recording, tmp_path, monkeypatch, capsys):
             write_json(run.folder / FIGURES, {**made.content, "run": run.specification.to_dict()})
 
     monkeypatch.setattr(comparing, "do_runs", train)
+    monkeypatch.setattr(comparing, "draw_plots", lambda *_: [])
+    # whether LiDAR lies on the pictures takes a minute, and is of test_wrong_recordings.py
+    monkeypatch.setattr(build, "check_lidar", lambda *_: LidarCheck((), ()))
     monkeypatch.setattr(comparing, "check_scene", lambda *_: "")
     monkeypatch.setattr(demo, "process", lambda given, console: convert(replace(given, refine_poses=False), console))
     monkeypatch.chdir(tmp_path)
