@@ -51,12 +51,26 @@ DEAD = 2**22 + 1
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
-    return write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=5, beams=800, size=32)
+    return write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=4, beams=800, size=32)
 
 
-def options_of(room: RoomDrive, output: Path, **changes) -> Kitti360Options:
-    given = {"root": room.root, "sequence": SEQUENCE, "output": output, "sweeps": 1, "find_ego": False}
-    return Kitti360Options(**{**given, "estimate_depth": False, **changes})
+def options_of(room: RoomDrive, output: Path) -> Kitti360Options:
+    left_out = {"find_ego": False, "refine_poses": False, "motion": False, "estimate_depth": False}
+    return Kitti360Options(root=room.root, sequence=SEQUENCE, output=output, sweeps=1, **left_out)
+
+
+def words_of(room: RoomDrive) -> list[str]:
+    """The same on the command line, but for the output."""
+    left_out = ["--no-find-ego", "--no-refine-poses", "--no-motion", "--no-estimate-depth"]
+    return ["process", "kitti360", "--root", str(room.root), "--sequence", SEQUENCE, "--sweeps", "1", *left_out]
+
+
+@pytest.fixture(scope="module")
+def whole(room: RoomDrive, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What is in the scene that nothing disturbs."""
+    folder = tmp_path_factory.mktemp("whole") / "scene"
+    process(options_of(room, folder), Console(quiet=True))
+    return contents(folder)
 
 
 # ---- files and caches ------------------------------------------------------------------------------------------
@@ -88,9 +102,8 @@ def spoil(path: Path, how: str) -> None:
     path.write_bytes(content)
 
 
-@pytest.mark.parametrize("kind", ["prior", "rays", "pixels"])
 @pytest.mark.parametrize("how", ["cut", "flipped", "of another version", "empty"])
-def test_a_spoiled_cache_is_made_again(tmp_path: Path, kind: str, how: str) -> None:
+def test_a_spoiled_cache_is_made_again(tmp_path: Path, how: str) -> None:
     scene = write_scene(tmp_path, frames=3)
     config = FisheyeDepthDataManagerConfig(dataparser=FisheyeDepthDataParserConfig(data=scene))
 
@@ -100,15 +113,17 @@ def test_a_spoiled_cache_is_made_again(tmp_path: Path, kind: str, how: str) -> N
         return rays.directions, batch["indices"], batch["image"], batch["prior_distance_m"], batch["prior_sigma_m"]
 
     whole = first_batch()
-    folder = scene / ".cache" / kind
-    files = sorted(folder.glob("*.np[yz]"))
-    before = {path: path.read_bytes() for path in files}
-    for path in files:
-        spoil(path, how)
-    if kind == "prior":
-        shutil.rmtree(scene / ".cache" / "pixels")  # or nobody would look at them
-    assert all(torch.equal(now, then) for now, then in zip(first_batch(), whole, strict=True))
-    assert {path: path.read_bytes() for path in sorted(folder.glob("*.np[yz]"))} == before
+    for kind in ("prior", "rays", "pixels"):
+        folder = scene / ".cache" / kind
+        files = sorted(folder.glob("*.np[yz]"))
+        before = {path: path.read_bytes() for path in files}
+        assert before, kind
+        for path in files:
+            spoil(path, how)
+        if kind == "prior":
+            shutil.rmtree(scene / ".cache" / "pixels")  # or nobody would look at them
+        assert all(torch.equal(now, then) for now, then in zip(first_batch(), whole, strict=True)), kind
+        assert {path: path.read_bytes() for path in sorted(folder.glob("*.np[yz]"))} == before, kind
 
 
 def test_a_changed_calibration_is_not_believed(tmp_path: Path) -> None:
@@ -222,19 +237,31 @@ def test_a_folder_that_nothing_was_written_to_is_taken_away(tmp_path: Path) -> N
     assert not (tmp_path / "a").exists()
 
 
-def test_two_processes_on_one_scene(room: RoomDrive, tmp_path: Path) -> None:
-    process(options_of(room, tmp_path / "alone"), Console(quiet=True))
-    code = "from edge_depth_nerf.entry import main; main()"
-    command = [sys.executable, "-c", code, "process", "kitti360", "--root", room.root, "--sequence", SEQUENCE]
-    command += ["--output", tmp_path / "scene", "--sweeps", "1", "--no-find-ego", "--no-estimate-depth"]
-    both = [
-        subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        for _ in range(2)
-    ]
-    said = [process.communicate()[0] for process in both]
-    assert [process.returncode for process in both] == [0, 0], said
+BOTH_AT_ONCE = """
+import os, sys
+import edge_depth_nerf.process.command, edge_depth_nerf.process.kitti360.converter  # once for both
+from edge_depth_nerf.entry import main
+children = []
+for said in sys.argv.pop(1), sys.argv.pop(1):
+    children.append(os.fork())
+    if not children[-1]:
+        for stream in 1, 2:
+            os.dup2(os.open(said, os.O_WRONLY | os.O_CREAT | os.O_APPEND), stream)
+        main()
+        sys.stdout.flush()
+        os._exit(0)
+assert [os.waitpid(child, 0)[1] for child in children] == [0, 0]
+"""
+
+
+def test_two_processes_on_one_scene(room: RoomDrive, whole: dict[str, bytes], tmp_path: Path) -> None:
+    logs = [tmp_path / name for name in ("one", "other")]
+    command = [sys.executable, "-c", BOTH_AT_ONCE, *logs, *words_of(room), "--output", tmp_path / "scene"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    said = [log.read_text() for log in logs]
+    assert done.returncode == 0, (done.stderr, said)
     assert sum("all of them were there" in text for text in said) == 1
-    assert contents(tmp_path / "scene") == contents(tmp_path / "alone")
+    assert contents(tmp_path / "scene") == whole
 
 
 # ---- killed ----------------------------------------------------------------------------------------------------
@@ -260,17 +287,14 @@ for last in lasts:
 """
 
 
-def test_process_killed_before_a_file_appears(room: RoomDrive, tmp_path: Path) -> None:
+def test_process_killed_before_a_file_appears(room: RoomDrive, whole: dict[str, bytes], tmp_path: Path) -> None:
     """One run, killed again and again, each time further on."""
-    process(options_of(room, tmp_path / "whole"), Console(quiet=True))
-    expected = contents(tmp_path / "whole")
     lasts = "process.json image_03/0000000003.npz points.ply transforms.json"
-    command = [sys.executable, "-c", DIE_AT_REPLACE, lasts, tmp_path / "scene", "process", "kitti360"]
-    command += ["--root", room.root, "--sequence", SEQUENCE, "--sweeps", "1", "--no-find-ego", "--no-estimate-depth"]
+    command = [sys.executable, "-c", DIE_AT_REPLACE, lasts, tmp_path / "scene", *words_of(room)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     process(options_of(room, tmp_path / "scene"), Console(quiet=True))
-    assert contents(tmp_path / "scene") == expected
+    assert contents(tmp_path / "scene") == whole
 
 
 def test_weights_that_were_read_predict_what_trained_ones_did(sample_drive: Path) -> None:
@@ -324,15 +348,16 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, number: int, mon
     ] in said
 
 
-def test_a_full_disk_and_then_a_larger_one(room: RoomDrive, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_full_disk_and_then_a_larger_one(
+    room: RoomDrive, whole: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = ["mount", "-t", "tmpfs", "-o", "size=24k", "tmpfs", str(disk)]
     if os.geteuid() != 0 or shutil.which("mount") is None or subprocess.run(mounted, check=False).returncode:
         pytest.skip("only root may mount a small disk")
     try:
-        command = ["edge-depth-nerf", "process", "kitti360", "--root", str(room.root), "--sequence", SEQUENCE]
-        command += ["--output", str(disk / "scene"), "--sweeps", "1", "--no-find-ego", "--no-estimate-depth"]
+        command = ["edge-depth-nerf", *words_of(room), "--output", str(disk / "scene")]
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sys, "argv", command)
             with pytest.raises(SystemExit) as ended:
@@ -344,8 +369,7 @@ def test_a_full_disk_and_then_a_larger_one(room: RoomDrive, tmp_path: Path, caps
             assert not [path for path in disk.rglob(".*") if "~" in path.name]
             subprocess.run(["mount", "-o", "remount,size=4m", str(disk)], check=True)
             entry.main()
-        process(options_of(room, tmp_path / "alone"), Console(quiet=True))
-        assert contents(disk / "scene") == contents(tmp_path / "alone")
+        assert contents(disk / "scene") == whole
         # one that can read-only
         subprocess.run(["mount", "--bind", str(disk), str(disk)], check=True)
         subprocess.run(["mount", "-o", "remount,bind,ro", str(disk)], check=True)
@@ -353,7 +377,7 @@ def test_a_full_disk_and_then_a_larger_one(room: RoomDrive, tmp_path: Path, caps
             write_maps(disk / "scene", "mono", [], {"trained_on": "elsewhere"})
         with pytest.raises(InputError, match="cannot be written"):
             process(options_of(room, disk / "other"), Console(quiet=True))
-        assert contents(disk / "scene") == contents(tmp_path / "alone")
+        assert contents(disk / "scene") == whole
     finally:
         while subprocess.run(["umount", "-l", str(disk)], capture_output=True, check=False).returncode == 0:
             pass
