@@ -54,7 +54,7 @@ def both(seed: int = 0, **size) -> tuple[HashEncoding, FusedHashEncoding]:
     return made[0], made[1]
 
 
-def points(scalings: torch.Tensor, count: int = 3000) -> torch.Tensor:
+def points(scalings: torch.Tensor, count: int = 1000) -> torch.Tensor:
     """Anywhere, on borders of cells, at -1, 0 and 1 on one to three axes, just beside them, and outside."""
     random = torch.rand(count, 3)
     at = torch.tensor([-1.0, 0.0, 1.0, 1e-8, 1 - 6e-8, -1e-8, 0.5, -0.3, 1.7])

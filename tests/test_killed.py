@@ -13,6 +13,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,7 +56,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
 
 
 def options_of(room: RoomDrive, output: Path) -> Kitti360Options:
-    left_out = {"find_ego": False, "refine_poses": False, "motion": False, "estimate_depth": False}
+    left_out: dict[str, Any] = dict.fromkeys(("find_ego", "refine_poses", "motion", "estimate_depth"), False)
     return Kitti360Options(root=room.root, sequence=SEQUENCE, output=output, sweeps=1, **left_out)
 
 

@@ -15,7 +15,7 @@ from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints
 
 pytestmark = pytest.mark.slow
 
-STEPS = 25
+STEPS = 12
 
 
 def test_two_trainings_are_the_same_bit_for_bit(tmp_path: Path) -> None:
@@ -28,7 +28,7 @@ def test_two_trainings_are_the_same_bit_for_bit(tmp_path: Path) -> None:
             *(str(Path(sys.executable).with_name("ns-train")), "edge-depth-nerf-lite", "--data", str(scene)),
             *("--output-dir", str(tmp_path / number), "--experiment-name", "same", "--timestamp", "run"),
             *("--max-num-iterations", str(STEPS), "--vis", "tensorboard", "--machine.seed", "5"),
-            *("--pipeline.datamanager.train-num-rays-per-batch", "128"),
+            *("--pipeline.datamanager.train-num-rays-per-batch", "128", "--pipeline.model.num-levels", "4"),
             *("--pipeline.model.log2-hashmap-size", "12", "--logging.local-writer.max-log-size", "0"),
         ]
         done = subprocess.run(
