@@ -151,7 +151,7 @@ WORDS = ["edge-depth-nerf", "synthesize", "--output", "drive", "--size", "64", "
 """
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.1, 1.0, 2.0])
+@pytest.mark.parametrize("seconds", [0.0, 0.1, 1.5])
 def test_ctrl_c_while_it_starts(tmp_path, seconds):
     """While options are read and libraries are imported."""
     code = """
