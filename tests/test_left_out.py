@@ -114,7 +114,7 @@ def test_a_mended_file_may_have_an_older_date(drive: RoomDrive) -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "change", "all_steps"), [(PICTURE, damage, False), (PICTURE, cut, False), (SWEEP, cut, True)]
+    ("file", "change", "all_steps"), [(PICTURE, damage, False), (PICTURE, cut, False), (SWEEP, cut, False)]
 )
 def test_a_file_that_is_mended_comes_into_the_scene(
     drive: RoomDrive, file: str, change: Change, all_steps: bool

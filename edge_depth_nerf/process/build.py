@@ -135,7 +135,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         )
         for picture in recording.pictures
     ]
-    scanners = keep_sweeps(recording, options, held_out, world_offset_m(frames), builder.found, console)
+    scanners = keep_sweeps(recording, options, held_out, world_offset_m(frames), console)
     report = write_scene(
         options.output,
         cameras,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import hashlib
+import shutil
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from rich.console import Console
 
 from edge_depth_nerf.base.console import run_jobs
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import write_text
 from edge_depth_nerf.lidar.patterns import rings_of
 from edge_depth_nerf.lidar.sweeps import Sweep, held_out_beams
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
@@ -23,7 +26,7 @@ from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import RecordedSweep, Recording
 from edge_depth_nerf.scene.sweeps import UNKNOWN_RING, SceneScanner, SceneSweep, SweepRays, write_rays
 
-FOLDER = "sweeps"
+FOLDER, MADE_OF = "sweeps", "made_of.sha256"
 
 
 def keep_sweeps(
@@ -31,17 +34,17 @@ def keep_sweeps(
     options: ProcessOptions,
     held_out: Collection[int],
     offset_m: Float64[np.ndarray, "3"],
-    made_from: Sequence[Path],
     console: Console,
 ) -> list[SceneScanner]:
     """Write the rays of the sweeps between the first picture and the last, those that are missing or out of date.
+
+    All are written anew if the sweeps or their poses are others than those of an earlier run.
 
     Args:
         recording: with a trajectory.
         options: where to; raw_lidar takes all points of a sweep as measured at once; holdout_beams marks rays.
         held_out: numbers of the frames that are kept from training.
         offset_m: the scene's origin in the recording's world.
-        made_from: files that all rays depend on, such as found poses.
         console: where progress is shown.
 
     Returns:
@@ -63,10 +66,12 @@ def keep_sweeps(
             pose[:3, 3] -= offset_m
             path = options.output / FOLDER / name / f"{number:010d}.npz"
             kept.append(SceneSweep(path, name, sweep.frame, sweep.time_s, sweep.frame in held_out, pose))
-            if not _is_fresh(path, [sweep.path, *made_from]):
-                write = partial(_write, path, sweep, recording.trajectory, offset_m, options)
-                jobs.append(partial(read_if_whole, write, strict=options.strict))
         scanners.append(SceneScanner(name, tuple(kept), sweeps[0].timing))
+        _remove_those_of_others(scanners[-1], sweeps, options)
+        for recorded, one in zip(sweeps, kept, strict=True):
+            if not (one.path.is_file() and one.path.stat().st_mtime_ns > recorded.path.stat().st_mtime_ns):
+                write = partial(_write, one.path, recorded, recording.trajectory, offset_m, options)
+                jobs.append(partial(read_if_whole, write, strict=options.strict))
     if jobs:
         run_jobs(jobs, "Keeping the scanners' rays", console)
     found = [
@@ -76,8 +81,17 @@ def keep_sweeps(
     return [scanner for scanner in found if scanner.sweeps]
 
 
-def _is_fresh(path: Path, made_from: Sequence[Path]) -> bool:
-    return path.is_file() and all(path.stat().st_mtime_ns > each.stat().st_mtime_ns for each in made_from)
+def _remove_those_of_others(scanner: SceneScanner, recorded: list[RecordedSweep], options: ProcessOptions) -> None:
+    """Remove a scanner's rays if they were made of other sweeps, or with other poses or options."""
+    made_of: list[object] = [scanner.timing, options.raw_lidar, options.holdout_beams]
+    for sweep, one in zip(recorded, scanner.sweeps, strict=True):
+        made_of.append((sweep.path.name, sweep.time_s, one.scanner_to_scene.tolist()))
+    digest = hashlib.sha256(repr(made_of).encode()).hexdigest()
+    folder = scanner.sweeps[0].path.parent
+    stated = folder / MADE_OF
+    if not stated.is_file() or stated.read_text(encoding="utf-8") != digest:
+        shutil.rmtree(folder, ignore_errors=True)
+        write_text(stated, digest)
 
 
 def _write(
