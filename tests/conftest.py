@@ -3,6 +3,7 @@
 import ast
 import gc
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -40,6 +41,21 @@ if Version(version("jaxtyping")) < Version("0.3.11"):
     for finder in sys.meta_path:
         if type(finder).__module__ == "jaxtyping._import_hook":
             finder.modules = [each for each in finder.modules if each != "edge_depth_nerf.kernels"]  # pyright: ignore
+
+ARRAYS = re.compile(r"\b(Bool|Float|Int|Shaped|UInt)\d*\[")
+with_shapes = jaxtyping.jaxtyped
+
+
+def jaxtyped(checked: Any = None, *, typechecker: Any) -> Any:
+    """Check calls of what has arrays in its signature: jaxtyping's checks are slow, and pyright knows other types."""
+    if checked is None:
+        return lambda function: jaxtyped(function, typechecker=typechecker)
+    if isinstance(checked, type) or ARRAYS.search(str(getattr(checked, "__annotations__", ""))):
+        return with_shapes(checked, typechecker=typechecker)
+    return checked
+
+
+jaxtyping.jaxtyped = jaxtyped
 
 HOST = "nerfstudio"
 LARGE_BYTES = 2 << 20
