@@ -194,6 +194,7 @@ def draw_plots(output: Path, results: Results) -> list[Plot]:
     }
     for_the_page = []
     for name, plot in kinds.items():
-        write_bytes(output / f"{name}.svg", plot(scenes, "").light)
-        for_the_page += [plot([scene], f": {scene}" if len(scenes) > 1 else "") for scene in scenes]
+        of_all = plot(scenes, "")
+        write_bytes(output / f"{name}.svg", of_all.light)
+        for_the_page += [plot([scene], f": {scene}") for scene in scenes] if len(scenes) > 1 else [of_all]
     return for_the_page

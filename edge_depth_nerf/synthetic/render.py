@@ -381,7 +381,9 @@ class FisheyeCamera:
         self._transmission = (1 - past**2 * (3 - 2 * past)).astype(np.float32)
         # a quarter of a pixel off the centre the ray is linear in the pixel, to some thousandths of a pixel
         grid = rays.reshape(self.height, self.width, 3).numpy()
-        along_y, along_x = (slope.reshape(-1, 3)[self._pixels] for slope in np.gradient(grid, axis=(0, 1)))
+        # beside a pixel that the lens cannot reach the slope is unknown
+        slopes = (np.nan_to_num(slope, nan=0.0) for slope in np.gradient(grid, axis=(0, 1)))
+        along_y, along_x = (slope.reshape(-1, 3)[self._pixels] for slope in slopes)
         fine = np.stack([grid.reshape(-1, 3)[self._pixels] + x * along_x + y * along_y for x, y in _SUBSAMPLES], 1)
         self._fine_rays = (fine / np.linalg.norm(fine, axis=-1, keepdims=True)).astype(np.float32)
         self._own_hit = np.zeros(self._fine_rays.shape[:2], bool)
