@@ -37,7 +37,7 @@ class InputError(ValueError):
 
 @contextmanager
 def found_in(where: str) -> Iterator[None]:
-    """Put in front of what is said of faulty input where it stands."""
+    """Put in front of an InputError's message where the faulty input stands."""
     try:
         yield
     except InputError as error:
