@@ -124,12 +124,12 @@ def enlarged(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float
     between = np.asarray(cv2.resize(inverse, whole, interpolation=cv2.INTER_LINEAR))
     # comparisons with NaN are false
     inverse = np.where(np.abs(between - nearest) <= _SMOOTH * nearest, between, nearest)
-    return padded(np.nan_to_num(1 / inverse), size, 0)
+    return padded(np.nan_to_num(1 / inverse), size, 0.0)
 
 
 def enlarged_sigma(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
     """Bring the distances' standard deviations to a picture's size (height, width): the nearest; 0 = none."""
-    result = padded(found.sigma_m.repeat(factor, 0).repeat(factor, 1), size, 0)
+    result = padded(found.sigma_m.repeat(factor, 0).repeat(factor, 1), size, 0.0)
     # a file has steps, the least of which still says that there is one
     return np.where(result > 0, np.maximum(result, np.float32(1 / DISTANCE_STEPS_PER_METRE)), result)
 
