@@ -9,8 +9,8 @@ a sky that never changes is not. Smooth road stays the same as well: what is fou
 that stays, or a texture at it that is the same in two halves of the pictures. Pictures are taken to stand upright.
 
 Lengths are shares of the picture's longer side, so the size of the pictures does not matter. A picture is used at
-`WORKING_PX` or less, and only if things have moved since the last one that was: a stop at a traffic light does not
-count, and memory stays below some 200 MB.
+`regions.WORKING_PX` or less, and only if things have moved since the last one that was: a stop at a traffic light does
+not count, and memory stays below some 200 MB.
 """
 
 from __future__ import annotations
