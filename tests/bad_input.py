@@ -7,7 +7,7 @@ import shutil
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -192,7 +192,7 @@ def weights(folder: Path) -> Path:
 
 
 def figures(folder: Path) -> Path:
-    run = RunSpecification("scene", "0" * 64, "lite", "edge", 0, None).to_dict()
+    run = asdict(RunSpecification("scene", "0" * 64, "lite", "edge", 0, None))
     write_json(
         folder / "scene/edge_seed-0/figures.json",
         {

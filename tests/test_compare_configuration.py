@@ -220,12 +220,6 @@ def test_lambda_and_sigma_go_where_each_method_has_them():
     assert setting("nerfacto") == (None, None)
 
 
-def test_rivals_in_torch_change_nothing_else():
-    assert set(differing(resolved("ds-nerf", implementation="torch"), resolved("ds-nerf"))) == {
-        "pipeline.model.implementation"
-    }
-
-
 def test_departures_from_the_papers_protocol(tmp_path):
     names = [f"{index:03d}.png" for index in range(188)]
     meta = {

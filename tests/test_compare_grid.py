@@ -1,7 +1,7 @@
 """The grid of losses, priors and extras: its cells, its searches and its tables; nothing is trained."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -163,7 +163,7 @@ def made_up(monkeypatch):
                 off += {"tune_a": 0.0, "tune_b": 1.5 * (sigma == 2.0)}[Path(spec.scene).name]
                 result.figures["pixels_truth_psnr"] = 30 - off
             result.content["lambda"], result.content["sigma"] = spec.weight, spec.sigma_m
-            write_json(run.folder / "figures.json", {**result.content, "run": spec.to_dict()})
+            write_json(run.folder / "figures.json", {**result.content, "run": asdict(spec)})
 
     stops: set[int] = set()
     monkeypatch.setattr(command, "do_runs", train)

@@ -1,7 +1,7 @@
 """The search for weights: its folders and what it writes."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ def test_a_search_writes_what_compare_takes(tmp_path, monkeypatch):
             assert spec.weight is not None
             loss = abs(math.log(spec.weight / best[0])) + abs(math.log(sigma / best[1]))
             result = fake("x", spec.method, spec.seed, pixels_truth_psnr=30 - loss)
-            write_json(run.folder / "figures.json", {**result.content, "run": spec.to_dict()})
+            write_json(run.folder / "figures.json", {**result.content, "run": asdict(spec)})
 
     monkeypatch.setattr(command, "do_runs", train)
     scene, output = write_scene(tmp_path / "x"), tmp_path / "out"

@@ -5,7 +5,7 @@ import re
 import shlex
 import subprocess
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -150,7 +150,7 @@ def test_a_recording_of_ones_own(recording, tmp_path, monkeypatch, capsys):
             write_rendered(Path(run.specification.scene), run.folder / VIEWS, 0.9 if better else 0.6)
             (run.folder / "config.yml").touch()
             made = fake("my drive", run.specification.method, 0, 25.0 if better else 22.5)
-            write_json(run.folder / FIGURES, {**made.content, "run": run.specification.to_dict()})
+            write_json(run.folder / FIGURES, {**made.content, "run": asdict(run.specification)})
 
     monkeypatch.setattr(comparing, "do_runs", train)
     monkeypatch.setattr(comparing, "draw_plots", lambda *_: [])

@@ -47,10 +47,6 @@ def in_a_room(along: np.ndarray) -> np.ndarray:
     return np.where(along > 0, to_high, np.where(along < 0, to_low, np.inf)).min(-1)
 
 
-def layer_of(view: PinholeView, said: np.ndarray) -> Layer:
-    return Layer(view.box, view.back(said.astype(np.float32)), view.cosine, view.weight)
-
-
 @pytest.mark.parametrize(
     ("lens", "theta_deg", "count"),
     [
@@ -128,7 +124,7 @@ def test_an_exact_network_gives_the_truth(kind):
         z = in_a_room(seen) * (seen @ view.view_to_camera[:, 2])
         scale, shift = rng.uniform(0.3, 3), rng.uniform(-1, 1)
         said = {"metric": z, "relative": scale * z + 5 * shift, "inverse": scale / z + 0.2 * shift}[kind]
-        layers.append(layer_of(view, said))
+        layers.append(view.layer(said))
     samples = take_samples(layers, lidar, WITHIN, 3000)
     lines = fit_lines(samples, kind, [Line()] * len(layers) if kind == "metric" else None)
     blended = blend(layers, lines, kind, (LENS.height, LENS.width))
@@ -148,7 +144,7 @@ def test_metric_views_that_differ_by_factors_meet_in_the_middle():
     layers = []
     for view, factor in zip(views, factors, strict=True):
         seen = view_rays(view)
-        layers.append(layer_of(view, factor * in_a_room(seen) * (seen @ view.view_to_camera[:, 2])))
+        layers.append(view.layer(factor * in_a_room(seen) * (seen @ view.view_to_camera[:, 2])))
     samples = take_samples(layers, np.zeros(WITHIN.shape, np.float32), WITHIN, 3000)
     lines = fit_lines(samples, "metric", [Line()] * len(views))
     left = np.log([line.scale * factor for line, factor in zip(lines, factors, strict=True)])
@@ -207,7 +203,7 @@ def test_frames_with_few_points_take_the_drives_fit(tmp_path, kind):
             seen = view_rays(view)
             z = seen_in_the_ball(picture, seen) * (seen @ view.view_to_camera[:, 2])
             scale, shift = odd * rng.uniform(0.5, 2), rng.uniform(-0.05, 0.05)
-            said.append(layer_of(view, scale * z + shift if kind == "relative" else scale / z + shift))
+            said.append(view.layer(scale * z + shift if kind == "relative" else scale / z + shift))
         return said
 
     fitted = FittedMaps(scene, kind, layers)
@@ -352,8 +348,8 @@ def test_the_maps_in_the_scene_are_those_of_the_network(networks, tmp_path):
     network = load_ready_network(str(networks / "glpn"))
     picture = scene.pictures[0]
     rgb = read_image(picture.files["image"])
-    (layer,) = view_layers(network, scene, picture)
     (view,) = pinhole_views(picture.lens, scene.theta_max_rad)
+    (layer,) = view_layers(network, [view], rgb)
     z = network([view.cut(rgb)])[0]
     to_x, to_y, ahead = np.moveaxis(scene.rays(picture).directions, -1, 0)
     x = to_x / ahead * view.focal_px + view.width / 2 - 0.5

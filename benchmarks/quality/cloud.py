@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 from scipy.spatial import KDTree
 
-from edge_depth_nerf.export.cloud import camera_to_scene, normals_of
+from edge_depth_nerf.export.cloud import normals_of
 from edge_depth_nerf.export.command import export_scene
 from edge_depth_nerf.export.options import ExportOptions
 from edge_depth_nerf.lidar.scans import read_cloud
@@ -32,12 +32,12 @@ def surfaces(scene: SceneFolder) -> tuple[np.ndarray, np.ndarray]:
         distance_m, rays = scene.distance_m(picture, "truth_distance"), scene.rays(picture)
         assert distance_m is not None
         row, column = np.nonzero(rays.within & (distance_m > 0) & (distance_m < FARTHEST_M))
-        pose = camera_to_scene(picture)
+        pose = picture.pose
         in_camera = rays.directions[row, column] * distance_m[row, column, None]
         points.append(in_camera @ pose[:3, :3].T + pose[:3, 3])
         found = normals_of(distance_m.astype(np.float64), rays.directions, row, column, 3)
         normals.append(found @ pose[:3, :3].T)
-    return np.concatenate(points) + scene.meta.get("world_offset_m", 0.0), np.concatenate(normals)
+    return np.concatenate(points) + scene.world_offset_m, np.concatenate(normals)
 
 
 def main() -> None:

@@ -8,6 +8,8 @@ what our command and nerfstudio's share in ending early.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 PROGRAM = "edge-depth-nerf"
@@ -31,6 +33,15 @@ class InputError(ValueError):
             half = LONGEST_MESSAGE // 2
             message = f"{message[:half]} … {message[-half:]}"
         super().__init__("".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in message))
+
+
+@contextmanager
+def found_in(where: str) -> Iterator[None]:
+    """Put in front of an InputError's message where the faulty input stands."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def debugging() -> bool:

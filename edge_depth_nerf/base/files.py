@@ -7,6 +7,7 @@ Masks on disk are 8-bit PNGs: 255 = use the pixel, 0 = ignore it. Pictures are R
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import math
 import os
@@ -136,6 +137,11 @@ def as_people_count(path: Path) -> list[tuple[int, str]]:
 def write_bytes(path: Path, content: bytes) -> None:
     """Write bytes atomically."""
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file that fits into memory, hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def write_text(path: Path, content: str) -> None:

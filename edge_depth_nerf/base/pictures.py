@@ -194,9 +194,8 @@ def tinted(
 
 def _blank(width: int, height: int) -> Figure:
     """A white figure of so many pixels, to be written and drawn on."""
-    from matplotlib.figure import (
-        Figure,
-    )  # takes a third of a second; and no pyplot, which keeps one state for all threads
+    # takes a third of a second; and no pyplot, which keeps one state for all threads
+    from matplotlib.figure import Figure
 
     # with 64 pixels an inch, a power of two, none gets lost in rounding
     return Figure((width / 64, height / 64), dpi=64)

@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 
 from edge_depth_nerf.base.bounds import finite, read_text, shown
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.cameras.models import MEI, Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.cameras.wide import EUCM, DoubleSphere, OCam
@@ -239,7 +239,5 @@ def _camera(model: Any, given: dict[str, float], size: Any, where: str) -> Camer
     # what has no distortion has none of its numbers
     none = {key: 0.0 for key in ("k1", "k2", "p1", "p2") if model is MEI}
     centred = {**none, **given, "cx": given["cx"] + 0.5, "cy": given["cy"] + 0.5}
-    try:
+    with found_in(where):
         return model(width=int(sides["width"]), height=int(sides["height"]), **centred)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None

@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 from edge_depth_nerf.base.bounds import finite, shown
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.cameras.models import MEI, Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.cameras.wide import EUCM, DoubleSphere, OCam
 
@@ -42,7 +42,5 @@ def camera_from_dict(parameters: dict[str, Any], where: str) -> Camera:
             kind = "a whole number" if whole else "a finite number"
             raise InputError(f"{where}: {key} of the {name} camera is {shown(parameters[key])}, expected {kind}.")
         numbers[key] = int(value) if whole else value
-    try:
+    with found_in(where):
         return model(**numbers)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float64
+from numpy.typing import NDArray
 
 from edge_depth_nerf.base.bounds import MAX_LENGTH_M
 from edge_depth_nerf.base.errors import InputError
@@ -12,6 +15,15 @@ Transform = Float64[np.ndarray, "4 4"]
 
 ROTATION_TOLERANCE = 1e-4
 """How far R·Rᵀ may be from the identity. KITTI-360's own files keep 1e-10; six written digits still pass."""
+
+
+def rigid(
+    rotation: Float64[np.ndarray, "*n 3 3"], shift_m: NDArray | Sequence[float] | float = 0.0
+) -> Float64[np.ndarray, "*n 4 4"]:
+    """Make transforms of rotations and of shifts, x, y, z."""
+    found = np.zeros((*rotation.shape[:-2], 4, 4))
+    found[..., :3, :3], found[..., :3, 3], found[..., 3, 3] = rotation, shift_m, 1
+    return found
 
 
 def check_rigid(transform: Transform, where: str) -> None:

@@ -7,6 +7,7 @@ import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from rich.console import Console
 from edge_depth_nerf.base.bounds import finite, shown
 from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import check_is_folder, read_json_object, write_json, write_png, write_text
+from edge_depth_nerf.base.files import check_is_folder, read_json_object, sha256_of, write_json, write_png, write_text
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.base.pictures import DISTANCE, resize, side_by_side, with_colour_bar
 from edge_depth_nerf.compare.methods import METHODS, MethodName, Setting, default_methods
@@ -108,7 +109,6 @@ def _opened_runs(options: CompareOptions | SearchOptions, tuned: Mapping[MethodN
                 steps=options.steps,
                 weight=setting.weight,
                 sigma_m=setting.sigma_m,
-                implementation=compared.rivals_implementation if compared and METHODS[name].rival else "same",
                 whole_views=compared is not None,
                 detail=compared is not None and compared.detail,
                 layers_sha256=of_layers[scene],
@@ -173,7 +173,7 @@ def layers_digest(folder: Path) -> str:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file, but {transforms} names it. Process the drive again.")
         digest.update(f"{name}\n".encode())
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
+        digest.update(bytes.fromhex(sha256_of(path)))
     return digest.hexdigest()
 
 
@@ -208,7 +208,7 @@ def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> str
                 f"{path}: has no {' and no '.join(LAYERS[source].words for source in missing)}, which the method "
                 f"{name} (preset {preset}) needs. {remedies}, or choose other --methods."
             )
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return sha256_of(path)
 
 
 def read_tuned(path: Path) -> dict[MethodName, Setting]:
@@ -265,7 +265,7 @@ def _record(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, 
         "kind": "comparison" if compared else "search",
         "preset": options.preset,
         "steps": options.steps,
-        "rivals_implementation": compared.rivals_implementation if compared else "same",
+        "rivals_implementation": "same",
         "detail": compared is not None and compared.detail,
     }
     path = options.output / RECORD
@@ -331,7 +331,7 @@ class Run:
         Raises:
             InputError: the folder holds the run of another scene or of other settings.
         """
-        path, wanted = self.folder / SPECIFICATION, self.specification.to_dict()
+        path, wanted = self.folder / SPECIFICATION, asdict(self.specification)
         if not path.is_file():
             write_json(path, wanted)
             return

@@ -58,7 +58,6 @@ def configuration(run: RunSpecification, folder: Path | None = None) -> tuple[Tr
         **(literal_form() if method.variant == "paper" else {}),
         **method.overrides,
         **Setting(run.weight, run.sigma_m).overrides(method),
-        **({"pipeline.model.implementation": "torch"} if run.implementation == "torch" else {}),
     }
     apply_overrides(config, {**shared, **named}, f"method {run.method}")
     return config, set(named)

@@ -134,11 +134,6 @@ class Method:
         return SIGMA_FIELDS.get(self.loss)
 
     @property
-    def rival(self) -> bool:
-        """Whether it is nerfstudio's, not ours."""
-        return self.loss != "edge" and not self.extras
-
-    @property
     def by_default(self) -> bool:
         """Whether it is compared though nobody names it: each loss as usual, and ours with each prior."""
         return self == self._usual or (self.loss == "edge" and self.extras and not self.variant)

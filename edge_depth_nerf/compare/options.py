@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
 
 import tyro
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.compare.methods import GRID, METHODS, MethodName, Preset, Setting, Sigma, check_name
 from edge_depth_nerf.jobs.cluster_address import check_address
-
-Implementation = Literal["same", "torch"]
 
 LEAST_LAMBDAS, LEAST_SIGMAS = 4, 3
 """A search over less says little."""
@@ -92,9 +89,6 @@ class CompareOptions(TrainingOptions):
     """λ and σ of the methods: tuned.json of a search. Not set: the defaults."""
     detail: bool = False
     """Evaluate all views twice, also with the detail of training pictures. This takes longer."""
-    rivals_implementation: Annotated[Implementation, tyro.conf.Suppress] = "same"
-    """torch: nerfacto, ds-nerf and both forms of UrbanNeRF run in nerfstudio's own torch code, with the same results,
-    to compare at equal seconds."""
 
 
 @dataclass(frozen=True, kw_only=True)

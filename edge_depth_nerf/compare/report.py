@@ -65,9 +65,7 @@ def _shared(results: Results) -> Facts:
         "Preset": options["preset"],
         "Steps of each run": f"{run.content['steps']:,}",
         "Seeds": ", ".join(map(str, results.seeds())),
-        "nerfacto, UrbanNeRF and DS-NeRF": "in nerfstudio's torch code"
-        if options.get("rivals_implementation") == "torch"
-        else "in the same kernels as ours",
+        "nerfacto, UrbanNeRF and DS-NeRF": "in the same kernels as ours",
         "Trained on": run.content["device"],
         "Cores of the machine": str(results.cores),
     }

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from edge_depth_nerf.compare.methods import MethodName, Preset, Sigma
-from edge_depth_nerf.compare.options import Implementation
 
 SPECIFICATION = "run.json"
 """What is trained."""
@@ -38,15 +36,11 @@ class RunSpecification:
     """λ, where it is not the method's own."""
     sigma_m: Sigma | None = None
     """σ, metres, or own; None: the method's own."""
-    implementation: Implementation = "same"
-    """torch: in nerfstudio's own torch code."""
+    implementation: str = "same"
+    """Always this: all methods run in the same kernels."""
     whole_views: bool = True
     """Whether whole views are evaluated at the end, or only the random pixels."""
     detail: bool = False
     """Whether whole views are evaluated with the detail of training pictures, too."""
     layers_sha256: str = ""
     """Of the scene's masks and maps; empty: not known."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """What run.json holds."""
-        return asdict(self)

@@ -399,8 +399,6 @@ def introduction(results: Results) -> list[str]:
         lines.append("FLIP: the difference that a viewer sees, 0 (none) to 1.")
     if not any(name.endswith("lpips") for run in results.runs for name in run.figures):
         lines.append("LPIPS is missing: its weights were not on this machine.")
-    if any(run.specification["implementation"] == "torch" for run in results.runs):
-        lines.append("nerfacto, UrbanNeRF and DS-NeRF ran in nerfstudio's own torch code.")
     maps = []
     for trained_on, title in MAPS.items():
         scenes = sorted({run.scene for run in results.runs if run.content.get("mono_trained_on") == trained_on})

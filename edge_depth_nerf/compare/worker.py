@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -229,7 +230,7 @@ def do_run(folder: Path) -> None:
     write_json(
         folder / FIGURES,
         {
-            "run": run.to_dict(),
+            "run": asdict(run),
             "named": sorted(named),
             "configuration": resolved,
             "lambda": weight,

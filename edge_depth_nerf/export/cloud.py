@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
+from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.files import read_npz, write_atomically
-from edge_depth_nerf.cameras.transforms import Transform, opencv_to_opengl
 from edge_depth_nerf.export.priors import Priors
 from edge_depth_nerf.lidar.sweeps import first_in_voxel, voxel_keys
 from edge_depth_nerf.scene.reader import ScenePicture
@@ -59,13 +59,6 @@ class Cloud:
         return Cloud(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
-def camera_to_scene(picture: ScenePicture) -> Transform:
-    """Give a picture's pose, camera (OpenCV) to scene."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = picture.rotation, picture.position_m
-    return opencv_to_opengl(pose)
-
-
 def neighbours_of(picture: ScenePicture, others: Sequence[ScenePicture]) -> list[ScenePicture]:
     """Choose the nearest pictures that may see the same from elsewhere."""
     away_m = {other.name: float(np.linalg.norm(other.position_m - picture.position_m)) for other in others}
@@ -90,7 +83,7 @@ def part_of(
     row, column = np.nonzero(usable)
     surest = np.argsort(sigma_m[row, column] / distance_m[row, column], kind="stable")
     row, column = row[surest], column[surest]
-    pose = camera_to_scene(picture)
+    pose = picture.pose
     outward = found.directions[row, column].astype(np.float64)
     points_m = (outward * distance_m[row, column, None]) @ pose[:3, :3].T + pose[:3, 3]
     first = first_in_voxel(points_m, voxel_m)
@@ -166,7 +159,7 @@ def _seen_at(
     Int64[np.ndarray, "seen"], Int64[np.ndarray, "seen"], Int64[np.ndarray, "seen"], Float64[np.ndarray, "seen"]
 ]:
     """Give which points lie in a picture, hidden ones included: their indices, rows, columns and distances."""
-    pose = camera_to_scene(picture)
+    pose = picture.pose
     in_camera = (points_m - pose[:3, 3]) @ pose[:3, :3]
     pixels, valid = picture.lens.project(torch.from_numpy(in_camera))
     seen = np.flatnonzero((valid & picture.lens.inside(pixels)).numpy())
@@ -235,11 +228,8 @@ def cloud_rows(cloud: Cloud, offset_m: Float[np.ndarray, "3"], number: str = "<f
     """Give rows for a PLY file: place plus an offset, normal, colour, sigma."""
     kinds = [(axis, number) for axis in "xyz"] + [(f"n{axis}", "<f4") for axis in "xyz"]
     kinds += [(name, "u1") for name in ("red", "green", "blue")] + [("sigma", "<f4")]
-    rows = np.empty(len(cloud.points_m), kinds)
     columns = np.hstack((cloud.points_m + offset_m, cloud.normals, rgb_of(cloud), cloud.sigma_m[:, None]))
-    for column, name in enumerate(rows.dtype.names or ()):
-        rows[name] = columns[:, column]
-    return rows
+    return unstructured_to_structured(columns, np.dtype(kinds))
 
 
 def rgb_of(cloud: Cloud) -> UInt8[np.ndarray, "points 3"]:

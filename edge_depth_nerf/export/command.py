@@ -71,12 +71,7 @@ def _record(options: ExportOptions, scene: SceneFolder) -> dict[str, Any]:
     """Describe what an export is made of: the options, and the scene's files by size and time of change."""
     paths = {scene.path, scene.folder / CALIBRATION_FILE}
     paths |= {path for picture in scene.pictures for path in picture.files.values()}
-    stamps = [
-        (str(path), found.st_size, found.st_mtime_ns)
-        for path in sorted(paths)
-        if path.is_file()
-        for found in [path.stat()]
-    ]
+    stamps = [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(paths) if path.is_file()]
     given = {key: value for key, value in dataclasses.asdict(options).items() if key not in ("scene", "output")}
     return {
         "made_by": f"edge-depth-nerf {__version__}",
@@ -96,8 +91,7 @@ def _write(output: Path, options: ExportOptions, scene: SceneFolder, priors: Pri
     figures = figures_of(cloud, scene.points_m())
     write_json(output / EXPORT_FIGURES, figures)
     if options.form == "points":
-        offset_m = np.array(scene.meta.get("world_offset_m", [0.0, 0.0, 0.0]), np.float64)
-        write_bytes(output / POINTS, ply_bytes(cloud_rows(cloud, offset_m, "<f8")))
+        write_bytes(output / POINTS, ply_bytes(cloud_rows(cloud, scene.world_offset_m, "<f8")))
         _show(console, output, figures, [])
         return
     views, writer = views_of(scene, priors.stems, options), ViewWriter(output, priors, options)

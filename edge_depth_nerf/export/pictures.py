@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from edge_depth_nerf.base.files import write_atomically, write_mask, write_png
 from edge_depth_nerf.cameras import Pinhole
 from edge_depth_nerf.cameras.transforms import Transform
-from edge_depth_nerf.export.cloud import SIGMAS, Cloud, camera_to_scene
+from edge_depth_nerf.export.cloud import SIGMAS, Cloud
 from edge_depth_nerf.export.cuts import Cut, cuts_of
 from edge_depth_nerf.export.options import ExportOptions
 from edge_depth_nerf.export.priors import Priors
@@ -58,7 +58,7 @@ class ExportedView:
     @property
     def view_to_scene(self) -> Transform:
         """Its pose, with OpenCV's axes."""
-        pose = camera_to_scene(self.picture)
+        pose = self.picture.pose
         pose[:3, :3] = pose[:3, :3] @ self.cut.view_to_camera
         return pose
 

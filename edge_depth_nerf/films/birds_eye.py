@@ -23,7 +23,7 @@ from edge_depth_nerf.base.files import open_folder, read_npz, remove_leftovers, 
 from edge_depth_nerf.films.birds_eye_options import RANGES, BirdsEyeOptions
 from edge_depth_nerf.films.ground_plan import TILE_PX, GroundPlan, Tile, driven_path
 from edge_depth_nerf.films.paths import up_of
-from edge_depth_nerf.films.placed import placed, world_offset_m
+from edge_depth_nerf.films.placed import placed
 from edge_depth_nerf.films.scanning import HIT, Caster, load_model
 from edge_depth_nerf.films.seen import TrainingViews
 from edge_depth_nerf.jobs.runs import steps_done
@@ -82,7 +82,7 @@ def render_birds_eye(options: BirdsEyeOptions, console: Console | None = None) -
             with console.status("Loading the model …"), quiet_host():
                 caster = Caster(load_model(options.load_config, scene.path), to_model)
             _render(output, missing, len(tiles), plan, caster, TrainingViews(scene, caster), options.above_m, console)
-        _put_together(output, tiles, plan, world_offset_m(scene))
+        _put_together(output, tiles, plan, scene.world_offset_m)
     shutil.rmtree(output / TILES, ignore_errors=True)
     side = f"{100 * options.metres_per_pixel:g} cm"
     say(console, f"The road from above, {plan.width}×{plan.height} px of {side}, and its heights:")

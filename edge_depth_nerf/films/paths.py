@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.cameras.transforms import rigid
 
 EASE = 0.25
 """Share of a shifted film in which the camera moves aside. It moves back during the same share at the end."""
@@ -104,7 +105,7 @@ class CameraPath:
         At the drive's own times they are exactly its poses. Between them they are smooth (twice differentiable).
         """
         position, rotation = self._splines
-        return _poses(rotation(times_s).as_matrix(), position(times_s))
+        return rigid(rotation(times_s).as_matrix(), position(times_s))
 
 
 def up_of(rotations: Float64[np.ndarray, "poses 3 3"]) -> Direction:
@@ -187,7 +188,7 @@ def orbit(
     outward = -np.cos(angle) * ahead + np.sin(angle) * -left
     right = np.cross(-outward, drive.up)
     rotation = np.stack((right, np.broadcast_to(drive.up, right.shape), outward), axis=2)
-    return _poses(rotation, centre + radius_m * outward), radius_m
+    return rigid(rotation, centre + radius_m * outward), radius_m
 
 
 def _free_radius_m(centre: Direction, up: Direction, points_m: Float[np.ndarray, "points 3"] | None) -> float:
@@ -207,9 +208,3 @@ def _ease(share: np.ndarray) -> np.ndarray:
     """Rise from 0 at 0 to 1 at 1, with zero speed at both ends."""
     share = np.clip(share, 0, 1)
     return share**2 * (3 - 2 * share)
-
-
-def _poses(rotation: np.ndarray, position: np.ndarray) -> Poses:
-    poses = np.tile(np.eye(4), (len(position), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = rotation, position
-    return poses

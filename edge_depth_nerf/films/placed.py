@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json_object
+from edge_depth_nerf.cameras.transforms import rigid
 from edge_depth_nerf.films.training import read_dataparser
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
@@ -43,15 +44,9 @@ class SceneToModel:
 
 def poses_of(pictures: Sequence[ScenePicture]) -> Float64[np.ndarray, "n 4 4"]:
     """Give the pictures' poses, camera (OpenGL) to scene."""
-    poses = np.tile(np.eye(4), (len(pictures), 1, 1))
-    poses[:, :3, :3] = [picture.rotation for picture in pictures]
-    poses[:, :3, 3] = [picture.position_m for picture in pictures]
-    return poses
-
-
-def world_offset_m(scene: SceneFolder) -> Float64[np.ndarray, "3"]:
-    """Give the scene's origin in the recording's world."""
-    return np.array(scene.meta.get("world_offset_m", [0.0, 0.0, 0.0]), np.float64)
+    return rigid(
+        np.stack([picture.rotation for picture in pictures]), np.stack([picture.position_m for picture in pictures])
+    )
 
 
 def outside(poses: Float64[np.ndarray, "n 4 4"], scene: SceneFolder) -> str | None:

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 from rich.console import Console
-from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import progress_bars, say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import open_folder, write_json, write_text
+from edge_depth_nerf.cameras.transforms import rigid
 from edge_depth_nerf.films.paths import CameraPath, lane_shift
-from edge_depth_nerf.films.placed import outside, placed, world_offset_m
+from edge_depth_nerf.films.placed import outside, placed
 from edge_depth_nerf.films.scan_files import Scan, write_scan
 from edge_depth_nerf.films.scan_options import RenderLidarOptions
 from edge_depth_nerf.films.scanning import Caster, RayDrop, evaluate, learn_ray_drop, load_model, recorded_pattern
@@ -23,7 +23,7 @@ from edge_depth_nerf.lidar.patterns import SENSORS, TEN_TURNS, ScanPattern, patt
 from edge_depth_nerf.lidar.scans import ScanFormat, read_scan
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.plugin.compat import quiet_host
-from edge_depth_nerf.process.poses import read_tum
+from edge_depth_nerf.process.poses import read_tum, tum_text
 from edge_depth_nerf.scene.reader import SceneFolder
 from edge_depth_nerf.scene.sweeps import SceneScanner, scanners_of
 
@@ -143,7 +143,7 @@ def _path(
     if len(times_s) < 2:
         raise InputError(f"{options.path}: {len(times_s)} poses, expected at least two: scans need the motion.")
     poses = poses.copy()
-    poses[:, :3, 3] -= world_offset_m(scene)
+    poses[:, :3, 3] -= scene.world_offset_m
     return times_s, poses
 
 
@@ -178,13 +178,8 @@ def _render(
 def _write_poses(
     path: Path, scene: SceneFolder, times_s: Float64[np.ndarray, "scans"], poses: Float64[np.ndarray, "scans 4 4"]
 ) -> None:
-    places = poses[:, :3, 3] + world_offset_m(scene)
-    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    lines = [
-        " ".join(f"{value:.9f}" for value in (time_s, *place, *turn))
-        for time_s, place, turn in zip(times_s, places, turns, strict=True)
-    ]
-    write_text(path, "\n".join(["# time x y z qx qy qz qw: scanner to world", *lines]) + "\n")
+    to_world = rigid(poses[:, :3, :3], poses[:, :3, 3] + scene.world_offset_m)
+    write_text(path, f"# time x y z qx qy qz qw: scanner to world\n{tum_text(times_s, to_world)}")
 
 
 def _show(figures: dict[str, dict[str, float]], console: Console) -> None:

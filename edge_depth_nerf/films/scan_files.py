@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Int16
+from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.files import write_bytes
@@ -28,15 +29,7 @@ class Scan:
 
 def _records(scan: Scan) -> NDArray:
     kinds = [*((axis, "<f4") for axis in "xyz"), ("time", "<f4"), ("ring", "<u2")]
-    rows = np.empty(len(scan.points_m), kinds)
-    for column, axis in enumerate("xyz"):
-        rows[axis] = scan.points_m[:, column]
-    rows["time"], rows["ring"] = scan.offset_s, scan.ring
-    return rows
-
-
-def _ply(scan: Scan) -> bytes:
-    return ply_bytes(_records(scan))
+    return unstructured_to_structured(np.column_stack((scan.points_m, scan.offset_s, scan.ring)), np.dtype(kinds))
 
 
 def _pcd(scan: Scan) -> bytes:
@@ -57,11 +50,11 @@ def _pcd(scan: Scan) -> bytes:
     return "\n".join(header).encode() + rows.tobytes()
 
 
-def _bin(scan: Scan) -> bytes:
-    return np.pad(scan.points_m.astype("<f4"), ((0, 0), (0, 1))).tobytes()
-
-
-_WRITERS: dict[str, Callable[[Scan], bytes]] = {"ply": _ply, "pcd": _pcd, "bin": _bin}
+_WRITERS: dict[str, Callable[[Scan], bytes]] = {
+    "ply": lambda scan: ply_bytes(_records(scan)),
+    "pcd": _pcd,
+    "bin": lambda scan: np.pad(scan.points_m.astype("<f4"), ((0, 0), (0, 1))).tobytes(),
+}
 
 
 def write_scan(path: Path, scan: Scan) -> None:

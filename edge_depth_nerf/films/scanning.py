@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
+from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.films.placed import SceneToModel
 from edge_depth_nerf.lidar.patterns import ScanPattern, pattern_of_scan
 from edge_depth_nerf.lidar.sweeps import MIN_RANGE_M
@@ -191,8 +192,7 @@ def learn_ray_drop(caster: Caster, scanner: SceneScanner, pattern: ScanPattern) 
 
 
 def _spread(sweeps: Sequence[SceneSweep], most: int) -> list[SceneSweep]:
-    places = np.unique(np.linspace(0, len(sweeps) - 1, min(most, len(sweeps))).round().astype(int))
-    return [sweeps[place] for place in places] if len(sweeps) else []
+    return [sweeps[place] for place in spread_over(len(sweeps), most)]
 
 
 def errors(measured_m: Float[np.ndarray, "rays"], rendered_m: Float[np.ndarray, "rays"]) -> dict[str, float]:

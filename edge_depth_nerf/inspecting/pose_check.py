@@ -10,7 +10,6 @@ import numpy as np
 from rich.console import Console
 
 from edge_depth_nerf.base.console import run_jobs
-from edge_depth_nerf.cameras.transforms import opencv_to_opengl
 from edge_depth_nerf.inspecting.figures import MEASURED_PICTURES
 from edge_depth_nerf.poses.matches import EpipolarAgreement, PosedPicture, along_drive
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
@@ -44,14 +43,11 @@ def check_poses(scene: SceneFolder, console: Console) -> list[EpipolarAgreement]
 
 
 def _posed(scene: SceneFolder, picture: ScenePicture) -> PosedPicture:
-    camera_to_world = np.eye(4)
-    camera_to_world[:3, :3], camera_to_world[:3, 3] = picture.rotation, picture.position_m
     return PosedPicture(
         camera=picture.camera,
         frame=picture.frame,
         lens=picture.lens,
-        # the change of axes is its own inverse
-        camera_to_world=opencv_to_opengl(camera_to_world),
+        camera_to_world=picture.pose,
         read_rgb=partial(scene.rgb, picture),
         read_usable=partial(scene.usable, picture),
     )

@@ -126,16 +126,6 @@ class _Header:
     """Where the points begin, in bytes."""
 
 
-def check_scan(path: Path, scan: ScanFormat) -> None:
-    """Check by its header and size that a file is whole and has the columns needed.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: of an unknown format, truncated, without points or without a column.
-    """
-    _read_header(path, scan)
-
-
 def read_scan(path: Path, scan: ScanFormat, time_s: float = 0.0) -> Sweep:
     """Read a scan and leave out what is not a measured point.
 
@@ -145,7 +135,7 @@ def read_scan(path: Path, scan: ScanFormat, time_s: float = 0.0) -> Sweep:
         FileNotFoundError: there is no such file.
         InputError: of an unknown format, broken, without a column needed, or without a single usable point.
     """
-    header = _read_header(path, scan)
+    header = check_scan(path, scan)
     columns = _read_columns(path, header, [*scan.needed, scan.name("intensity")], scan)
     points_m = np.stack([columns[scan.name(axis)] for axis in "xyz"], -1) * scan.metres_per_unit
     intensity = columns.get(scan.name("intensity"), np.zeros(len(points_m)))
@@ -190,7 +180,7 @@ def read_cloud(path: Path) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.nd
     if path.suffix.lower() != ".ply":
         raise InputError(f"{path}: a point cloud of unknown format; expected .ply.")
     scan, colours = ScanFormat(), ("red", "green", "blue")
-    columns = _read_columns(path, _read_header(path, scan, MAX_CLOUD_POINTS), [*scan.needed, *colours], scan)
+    columns = _read_columns(path, check_scan(path, scan, MAX_CLOUD_POINTS), [*scan.needed, *colours], scan)
     points = np.stack([columns[axis] for axis in "xyz"], -1)
     if not all(name in columns for name in colours):
         return points, None
@@ -200,7 +190,13 @@ def read_cloud(path: Path) -> tuple[Float64[np.ndarray, "points 3"], UInt8[np.nd
 # ---- headers ---------------------------------------------------------------------------------------------------
 
 
-def _read_header(path: Path, scan: ScanFormat, most: int = MAX_POINTS) -> _Header:
+def check_scan(path: Path, scan: ScanFormat, most: int = MAX_POINTS) -> _Header:
+    """Check by its header and size that a file is whole and has the columns needed, and at most so many points.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: of an unknown format, truncated, without points or without a column.
+    """
     size = check_bytes(path, _MAX_BYTES)
     readers = {
         **{".bin": _bin_header, ".npy": _npy_header, ".npz": _npz_header},

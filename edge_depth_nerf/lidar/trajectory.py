@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.cameras.transforms import rigid
 
 MAX_POSE_GAP_S = 1.0
 """Between poses further apart than this the path is not known well enough to place pictures or points."""
@@ -94,9 +95,7 @@ class Trajectory:
         corners = np.concatenate((np.zeros((1, 3)), np.eye(3)))
         stacked = torch.from_numpy(np.tile(corners, (len(times_s), 1)))
         moved = self.to_world(stacked, torch.from_numpy(np.repeat(times_s, 4))).numpy().reshape(-1, 4, 3)
-        poses = np.tile(np.eye(4), (len(times_s), 1, 1))
-        poses[:, :3, 3] = moved[:, 0]
-        poses[:, :3, :3] = np.swapaxes(moved[:, 1:] - moved[:, :1], 1, 2)
+        poses = rigid(np.swapaxes(moved[:, 1:] - moved[:, :1], 1, 2), moved[:, 0])
         # a pose that is given is given exactly
         known = np.searchsorted(self.times_s, times_s).clip(max=len(self.times_s) - 1)
         same = self.times_s[known] == times_s

@@ -9,8 +9,8 @@ a sky that never changes is not. Smooth road stays the same as well: what is fou
 that stays, or a texture at it that is the same in two halves of the pictures. Pictures are taken to stand upright.
 
 Lengths are shares of the picture's longer side, so the size of the pictures does not matter. A picture is used at
-`WORKING_PX` or less, and only if things have moved since the last one that was: a stop at a traffic light does not
-count, and memory stays below some 200 MB.
+`regions.WORKING_PX` or less, and only if things have moved since the last one that was: a stop at a traffic light does
+not count, and memory stays below some 200 MB.
 """
 
 from __future__ import annotations
@@ -36,12 +36,11 @@ from edge_depth_nerf.masks.regions import (
     opened,
     touching,
     whole_blocks,
+    working_factor,
 )
 
 Picture = UInt8[np.ndarray, "h w 3"]
 
-WORKING_PX = 700
-"""Pictures are averaged down until the longer side is no longer than this."""
 MIN_PICTURES = 10
 """Fewer pictures between which things have moved say too little: asphalt may look alike in a few."""
 MAX_PICTURES = 60
@@ -152,7 +151,7 @@ def find_ego(
     Raises:
         ValueError: a picture has another size than the lens.
     """
-    factor = math.ceil(max(lens.shape) / WORKING_PX)
+    factor = working_factor(lens.shape)
     small_lens = whole_blocks(lens, factor)
     if not small_lens.any():
         return NoEgo("The lens mask leaves no pixel.", could_tell=False)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_json_object, read_mask, write_json, write_mask
+from edge_depth_nerf.base.files import read_json_object, read_mask, sha256_of, write_json, write_mask
 
 EGO_MASKS = "ego_masks"
 """Folder of the scene with the vehicle's masks that were found, in the size of the raw pictures."""
@@ -33,7 +32,7 @@ def keep_ego_mask(scene: Path, camera: str, mask: NDArray[np.bool_], could_tell:
     unknown = _unknown(scene)
     wanted = {name: digest for name, digest in unknown.items() if name != camera}
     if not could_tell:
-        wanted[camera] = _digest(path)
+        wanted[camera] = sha256_of(path)
     if wanted != unknown:
         write_json(scene / EGO_MASKS / _UNKNOWN, wanted)
 
@@ -43,7 +42,7 @@ def vehicles_unknown(scene: Path) -> list[str]:
     found = []
     for camera, digest in _unknown(scene).items():
         path = ego_mask_path(scene, camera)
-        if path.is_file() and _digest(path) == digest:
+        if path.is_file() and sha256_of(path) == digest:
             found.append(camera)
     return found
 
@@ -53,7 +52,3 @@ def _unknown(scene: Path) -> dict[str, object]:
         return read_json_object(scene / EGO_MASKS / _UNKNOWN)
     except (InputError, OSError):
         return {}
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

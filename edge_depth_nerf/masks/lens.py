@@ -11,10 +11,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from edge_depth_nerf.cameras import Camera
-from edge_depth_nerf.masks.regions import block_mean
-
-WORKING_PX = 700
-"""Pictures are averaged down until the longer side is no longer than this; then the dark rim is searched for."""
+from edge_depth_nerf.masks.regions import block_mean, working_factor
 
 _ANGLES = 720
 """Number of directions from the picture's middle in which the rim is searched for."""
@@ -74,7 +71,7 @@ def dark_rim(pictures: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Bool[np.ndarray,
     for picture in pictures:
         if brightest is None:
             shape = picture.shape[:2]
-            factor = math.ceil(max(shape) / WORKING_PX)
+            factor = working_factor(shape)
         elif picture.shape[:2] != shape:
             raise ValueError(f"pictures of different sizes: {shape} and {picture.shape[:2]}")
         small = block_mean(np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.float32), factor)

@@ -8,17 +8,14 @@ the height along which the picture has an edge.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from edge_depth_nerf.masks.regions import block_mean, closed, dilated, enlarge, eroded, filled
+from edge_depth_nerf.masks.regions import closed, dilated, eroded, filled
 
-WORKING_PX = 700
-"""Pictures are averaged down until the longer side is no longer than this."""
 _FREE_REACH = 0.5
 _FREE_PX = 1.0
 """A LiDAR point stands for half the way to the next one; the outline may lie beyond that by so many times the way
@@ -95,18 +92,3 @@ def _discs(
     for (x, y), radius in zip(np.floor(centres_px).astype(int).tolist(), np.rint(radius_px).astype(int), strict=True):
         cv2.circle(painted, (x, y), int(radius), (1,), -1)
     return painted.astype(bool)
-
-
-def working_factor(shape: tuple[int, ...]) -> int:
-    """By how much pictures of a size are averaged down."""
-    return math.ceil(max(shape[:2]) / WORKING_PX)
-
-
-def smaller(picture: UInt8[np.ndarray, "H W 3"], factor: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Average a picture down."""
-    return picture if factor == 1 else block_mean(picture, factor)
-
-
-def larger_again(where: Bool[np.ndarray, "h w"], factor: int, shape: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """Undo `smaller` for a mask."""
-    return where if factor == 1 else enlarge(where, factor, shape)

@@ -9,6 +9,14 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64, Shaped, UInt8
 
+WORKING_PX = 700
+"""Pictures are averaged down until the longer side is no longer than this."""
+
+
+def working_factor(shape: tuple[int, ...]) -> int:
+    """By how much pictures of a size are averaged down to `WORKING_PX`."""
+    return math.ceil(max(shape[:2]) / WORKING_PX)
+
 
 def block_mean(values: UInt8[np.ndarray, "H W *c"] | Float32[np.ndarray, "H W"], factor: int) -> np.ndarray:
     """Average blocks of `factor`×`factor` pixels, in the type of the values; incomplete blocks are dropped."""

@@ -185,12 +185,8 @@ class _Blocks:
         height_sine: Float[np.ndarray, "h w"],
     ) -> None:
         """Work out what the steps share."""
-        self.usable, self.lidar_points, self.directions, self.height_sine = (
-            usable,
-            lidar_points,
-            directions,
-            height_sine,
-        )
+        self.usable, self.lidar_points = usable, lidar_points
+        self.directions, self.height_sine = directions, height_sine
         self.side = max(usable.shape)
         self.brightness = colour.max(-1)
         self.blue = np.log((colour[..., 2] + 8) / (colour[..., 0] + 8))

@@ -16,6 +16,7 @@ than elsewhere: by how much is measured in the field, at LiDAR points with and w
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -33,6 +34,7 @@ from rich.console import Console
 from edge_depth_nerf.base.checked_cache import keep_last, used
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import sha256_of
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.method.alignment import LEAST_POINTS, align, both, fit_logs
 from edge_depth_nerf.method.error_model import (
@@ -283,15 +285,13 @@ def _made_of(scene: SceneFolder, pictures: Sequence[ScenePicture], depth_source:
     digest = hashlib.sha256(
         json.dumps([CACHE_VERSION, relevant, maps_trained_on(scene.meta), units], sort_keys=True).encode()
     )
-    contents: dict[Path, bytes] = {}
+    content = functools.cache(sha256_of)
     for picture in pictures:
         pose = picture.rotation.round(9).tolist(), picture.position_m.round(6).tolist()
         digest.update(repr((picture.name, picture.lens, pose)).encode())
         for layer in ("lidar", "mono", "mask", *(["motion", *BESIDE_MOTION] if with_motion else [])):
             path = picture.files.get(layer)
-            if path is not None and path not in contents:
-                contents[path] = hashlib.sha256(path.read_bytes()).digest()
-            digest.update(layer.encode() + (b"" if path is None else contents[path]))
+            digest.update(layer.encode() + (b"" if path is None else bytes.fromhex(content(path))))
     return digest.hexdigest()[:16]
 
 

@@ -26,6 +26,7 @@ from rich.progress import Progress
 from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import sha256_of
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.method.alignment import LEAST_POINTS
@@ -57,7 +58,8 @@ from edge_depth_nerf.mono.network import (
     save_network,
 )
 from edge_depth_nerf.mono.options import EstimateDepthOptions, Preset
-from edge_depth_nerf.mono.relative import KIND_SAID
+from edge_depth_nerf.mono.pinhole_views import pinhole_views
+from edge_depth_nerf.mono.relative import KIND_SAID, Layer
 from edge_depth_nerf.mono.training import Trained, TrainingOptions, as_json, torch_threads, train
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
@@ -216,8 +218,12 @@ def _write_predicted(network: ReadyNetwork, scenes: Sequence[SceneFolder], conso
         "architecture": network.model_type,
         "output": network.kind,
     }
+
+    def layers(scene: SceneFolder, picture: ScenePicture) -> list[Layer]:
+        return view_layers(network, pinhole_views(picture.lens, scene.theta_max_rad), scene.rgb(picture))
+
     # all scenes' faults are told before the first one's work
-    fitted = [FittedMaps(scene, network.kind, functools.partial(view_layers, network, scene)) for scene in scenes]
+    fitted = [FittedMaps(scene, network.kind, functools.partial(layers, scene)) for scene in scenes]
     _write_fitted(fitted, source, console)
 
 
@@ -270,7 +276,7 @@ def _train(
         if start is None:
             radius_m = room_radius_m(material.examples)
             settings = replace(settings, camera_height_m=material.mean_height_m, room_radius_m=radius_m)
-        began_with = None if options.model is None else hashlib.sha256(options.model.read_bytes()).hexdigest()
+        began_with = None if options.model is None else sha256_of(options.model)
         made_of = {"training": asdict(training), "settings": asdict(settings), "start": began_with}
         identity = as_json({**made_of, "examples": material.examples.fingerprint()})
         if found is not None and about.get("identity") == identity:

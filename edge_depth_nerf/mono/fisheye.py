@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.masks.lens import dark_rim
 from edge_depth_nerf.mono.elsewhere import agreed
 from edge_depth_nerf.mono.files import count_m, find_map, read_map
-from edge_depth_nerf.mono.hf import Predict, load_ready_network
+from edge_depth_nerf.mono.hf import load_ready_network, view_layers
 from edge_depth_nerf.mono.options import Along, FisheyeDepthOptions
 from edge_depth_nerf.mono.pinhole_views import PinholeView, pinhole_views
 from edge_depth_nerf.mono.relative import Kind, Layer
@@ -99,8 +99,11 @@ def fisheye_depth(options: FisheyeDepthOptions, console: Console | None = None) 
         remove_leftovers(output)
         if network is not None:
             about = {"network": network.name, "kind": network.kind}
-            maps = partial(_predicted, network, fisheyes)
-            _make(output, fisheyes, {path: [] for path in fisheyes.pictures}, maps, network.kind, about, console)
+
+            def predicted(picture: Path) -> list[Layer]:
+                return view_layers(network, fisheyes.views, read_image(picture))
+
+            _make(output, fisheyes, {path: [] for path in fisheyes.pictures}, predicted, network.kind, about, console)
         elif options.maps is not None:
             assert options.maps_kind is not None
             found = {path: _maps_of(options.maps, path, fisheyes.views) for path in fisheyes.pictures}
@@ -190,18 +193,8 @@ def _read(found: dict[Path, list[Path]], fisheyes: Fisheyes, along: Along, metre
             f"{found[picture][0]}: neither this map nor one of the picture's other views contains a positive number. "
             "Make them again, or take the picture away."
         )
-    return [_layer(view, each, along) for view, each in zip(fisheyes.views, maps, strict=True)]
-
-
-def _predicted(predict: Predict, fisheyes: Fisheyes, picture: Path) -> list[Layer]:
-    rgb = read_image(picture)
-    maps = predict([view.cut(rgb) for view in fisheyes.views])
-    return [_layer(view, each, "z") for view, each in zip(fisheyes.views, maps, strict=True)]
-
-
-def _layer(view: PinholeView, values: Float32[np.ndarray, "height width"], along: Along) -> Layer:
-    cosine = view.cosine if along == "z" else np.ones_like(view.cosine)
-    return Layer(view.box, view.back(values), cosine, view.weight)
+    layers = [view.layer(each) for view, each in zip(fisheyes.views, maps, strict=True)]
+    return layers if along == "z" else [replace(each, cosine=np.ones_like(each.cosine)) for each in layers]
 
 
 def _make(

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.mono.options import HfOutput
-from edge_depth_nerf.mono.pinhole_views import pinhole_views
+from edge_depth_nerf.mono.pinhole_views import PinholeView
 from edge_depth_nerf.mono.relative import Kind, Layer
-from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 Predict = Callable[[Sequence[NDArray[np.uint8]]], Sequence[NDArray[np.float32]]]
 """Pictures (H×W×3, RGB) to maps (H×W) of z, of z up to scale and shift, or of its inverse."""
@@ -143,10 +142,7 @@ def _kind(name: str, config: Any, output: HfOutput) -> Kind:
     )
 
 
-def view_layers(predict: Predict, scene: SceneFolder, picture: ScenePicture) -> list[Layer]:
-    """Predict the pinhole views of a scene's picture."""
-    views, rgb = pinhole_views(picture.lens, scene.theta_max_rad), scene.rgb(picture)
+def view_layers(predict: Predict, views: Sequence[PinholeView], rgb: NDArray[np.uint8]) -> list[Layer]:
+    """Predict the pinhole views of a picture."""
     maps = predict([view.cut(rgb) for view in views])
-    return [
-        Layer(view.box, view.back(found), view.cosine, view.weight) for view, found in zip(views, maps, strict=True)
-    ]
+    return [view.layer(found) for view, found in zip(views, maps, strict=True)]

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
 from edge_depth_nerf.cameras.rays import rays
+from edge_depth_nerf.mono.relative import Layer
 
 HALF_ANGLE_DEG = 50.0
 """Of a view, from its axis to the middle of a border: wider, perspective stretches what networks know."""
@@ -67,6 +68,10 @@ class PinholeView:
         """
         found = _read(values.astype(np.float32), self.view_xy)
         return np.where((self.weight > 0) & np.isfinite(found), found, np.float32(np.nan))
+
+    def layer(self, values: Float[np.ndarray, "height width"]) -> Layer:
+        """What a map of the view says of the picture."""
+        return Layer(self.box, self.back(values), self.cosine, self.weight)
 
 
 def _read(pixels: NDArray, at_xy: NDArray[np.float32]) -> NDArray:

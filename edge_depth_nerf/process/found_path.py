@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float64
 
+from edge_depth_nerf.cameras.transforms import rigid
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.scene.writer import Skipped
@@ -83,10 +84,8 @@ def upright(recording: Recording, trajectory: Trajectory) -> Trajectory:
     reach = np.linalg.norm(away, axis=-1)
     ahead = away[int(np.argmax(reach >= reach.max() / 2))] if reach.max() > 0 else np.cross(up, rotations[0, :, 0])
     ahead = ahead / np.linalg.norm(ahead)
-    to_world = np.eye(4)
-    to_world[:3, :3] = np.stack((ahead, np.cross(up, ahead), up))
-    to_world[:3, 3] = -to_world[:3, :3] @ positions[0]
-    return Trajectory(trajectory.times_s, to_world @ trajectory.vehicle_to_world)
+    turn = np.stack((ahead, np.cross(up, ahead), up))
+    return Trajectory(trajectory.times_s, rigid(turn, -turn @ positions[0]) @ trajectory.vehicle_to_world)
 
 
 def _up_in_vehicle(recording: Recording) -> Float64[np.ndarray, "3"]:

@@ -35,10 +35,11 @@ from edge_depth_nerf.base.files import read_distance_png, read_image
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import rays
-from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.cameras.transforms import Transform, rigid
 from edge_depth_nerf.lidar import Sweep
 from edge_depth_nerf.lidar.scans import columns_told
 from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.lidar.world import offsets_s
 from edge_depth_nerf.process.reading import downscale_image, downscale_mask, read_depth, read_if_whole
 from edge_depth_nerf.process.readings import (
     CLEAR_SMALL,
@@ -206,12 +207,9 @@ def _moved(transform: Transform, points: Float[np.ndarray, "n 3"]) -> Float[np.n
     return points @ transform[:3, :3].T + transform[:3, 3]
 
 
-def _inverse(rigid: Transform) -> Transform:
+def _inverse(pose: Transform) -> Transform:
     """The inverse of a rotation and a translation; NumPy's takes a millisecond where threads are many."""
-    found = np.eye(4)
-    found[:3, :3] = rigid[:3, :3].T
-    found[:3, 3] = -rigid[:3, :3].T @ rigid[:3, 3]
-    return found
+    return rigid(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
 
 
 def _sampled(picture: Float32[np.ndarray, "h w"], places: Float[np.ndarray, "... 2"]) -> Float32[np.ndarray, "..."]:
@@ -273,14 +271,15 @@ class _View:
 
     def _pairs(self, recording: Recording) -> list[_Pair]:
         """Pictures spread over the drive, each with the next one from another place."""
-        pictures = sorted((one for one in recording.pictures if one.camera == self.camera.name), key=_time)
+        pictures = [one for one in recording.pictures if one.camera == self.camera.name]
+        pictures.sort(key=lambda one: one.time_s)
         places = np.array([recording.pose(picture)[:3, 3] for picture in pictures]).reshape(-1, 3)
         pairs = []
-        for first in dict.fromkeys(spread_over(len(pictures), _TRIED)) if pictures else ():
+        for first in spread_over(len(pictures), _TRIED):
             far = np.flatnonzero(np.linalg.norm(places[first + 1 :] - places[first], axis=-1) >= _MOVED_M)
             pairs += [(pictures[first], pictures[first + 1 + int(far[0])])] if len(far) else []
         found = []
-        for index in dict.fromkeys(spread_over(len(pairs), _PAIRS)) if pairs else ():
+        for index in spread_over(len(pairs), _PAIRS):
             read = [read_if_whole(partial(read_image, picture.path)) for picture in pairs[index]]
             if read[0] is None or read[1] is None:
                 continue
@@ -334,10 +333,6 @@ class _View:
         return float(_sampled(pair.edges, pixels[inside]).sum()), int(inside.sum())
 
 
-def _time(picture: RecordedPicture) -> float:
-    return picture.time_s
-
-
 def _projected(
     camera: Camera, points: Float64[np.ndarray, "n 3"]
 ) -> tuple[Float64[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
@@ -376,6 +371,7 @@ class _Source:
         self.name, self._path = name, recording.trajectory
         self.sweeps = sorted((one for one in recording.sweeps if one.scanner == name), key=lambda one: one.time_s)
         self._scans: dict[object, _Scan | None] = {}
+        self._maps: dict[object, tuple[np.ndarray, np.ndarray]] = {}
 
     def scan(self, recorded: RecordedSweep) -> _Scan | None:
         """Read a sweep, once."""
@@ -431,21 +427,17 @@ class _Source:
         return _moved(view.poses(pair, reading)[0], distance_m[:, None] * directions)
 
     @cached_property
-    def _maps(self) -> dict[object, tuple[np.ndarray, np.ndarray]]:
-        return {}
-
-    @cached_property
     def _two_sweeps(self) -> list[tuple[_Points, _Points]]:
         """Pairs of sweeps between which the vehicle has moved."""
         if len(self.sweeps) < 2:
             return []
         places = self._path.at(np.array([one.time_s for one in self.sweeps]))[:, :3, 3]
         pairs = []
-        for first in dict.fromkeys(spread_over(len(self.sweeps) - 1, _TRIED)):
+        for first in spread_over(len(self.sweeps) - 1, _TRIED):
             far = np.flatnonzero(np.linalg.norm(places[first + 1 :] - places[first], axis=-1) >= _SWEEPS_MOVED_M)
             pairs += [(first, first + 1 + int(far[0]))] if len(far) else []
         found = []
-        for index in dict.fromkeys(spread_over(len(pairs), 3)) if pairs else ():
+        for index in spread_over(len(pairs), 3):
             scans = [self.scan(self.sweeps[one]) for one in pairs[index]]
             if scans[0] is not None and scans[1] is not None:
                 found.append((scans[0].few, scans[1].many))
@@ -471,11 +463,8 @@ class _Source:
 
 
 def _scan(read: Sweep, recorded: RecordedSweep) -> _Scan:
-    points, times = read.points_m.double().numpy(), read.offset_s
-    if times is None:
-        none = torch.zeros(len(points), dtype=torch.float64)
-        times = none if recorded.timing is None else recorded.timing.offsets_s(read.points_m)
-    offset_s = times.double().numpy()
+    points = read.points_m.double().numpy()
+    offset_s = offsets_s(read, recorded.timing, deskew=True).double().numpy()
     order = np.random.default_rng(0).permutation(len(points))
 
     def some(index: np.ndarray) -> _Points:
@@ -587,7 +576,7 @@ def check_lidar(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h w
 
 def _file_warnings(source: _Source, views: Sequence[_View]) -> list[str]:
     """What the files themselves show: points beyond reach, other columns, maps that hold one value where none is."""
-    looked_at = [source.sweeps[index] for index in dict.fromkeys(spread_over(len(source.sweeps), 3))]
+    looked_at = [source.sweeps[index] for index in spread_over(len(source.sweeps), 3)]
     found = []
     for recorded in looked_at[:1]:
         if recorded.columns is not None and (told := columns_told(recorded.path)) != recorded.columns:

@@ -24,6 +24,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
+from edge_depth_nerf.lidar.world import offsets_s
 from edge_depth_nerf.poses.breaks import find_break
 from edge_depth_nerf.poses.odometry import MIN_SWEEPS, RANGE_M, TimedSweep, import_kiss_icp, odometry, steps_of
 from edge_depth_nerf.process.found_path import path_length_m, upright, with_path
@@ -125,11 +126,7 @@ def path_of(sweeps: Sequence[RecordedSweep], console: Console) -> Trajectory:
 def _read(sweep: RecordedSweep) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n"]]:
     """The points of a sweep that are used, in the vehicle's frame, and when each was measured."""
     read = sweep.read()
-    offset_s = torch.zeros(len(read.points_m), dtype=torch.float64)
-    if read.offset_s is not None:
-        offset_s = read.offset_s
-    elif sweep.timing is not None:
-        offset_s = sweep.timing.offsets_s(read.points_m)
+    offset_s = offsets_s(read, sweep.timing, deskew=True)
     range_m = read.points_m.norm(dim=-1)
     used = (range_m >= RANGE_M[0]) & (range_m <= RANGE_M[1])
     in_vehicle = transform_points(torch.from_numpy(sweep.to_vehicle), read.points_m[used])
@@ -137,7 +134,7 @@ def _read(sweep: RecordedSweep) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.
 
 
 def _usual_points(sweeps: Sequence[RecordedSweep]) -> float:
-    some = [sweeps[index] for index in dict.fromkeys(spread_over(len(sweeps), _LOOKED_AT))]
+    some = [sweeps[index] for index in spread_over(len(sweeps), _LOOKED_AT)]
     read = [len(sweep.points_m) for one in some if (sweep := read_if_whole(one.read)) is not None]
     return float(statistics.median(read or [0]))
 

@@ -59,7 +59,7 @@ def mask_warnings(recording: Recording, lenses: Mapping[str, Bool[np.ndarray, "h
 def _masks(recording: Recording, camera: RecordedCamera) -> list[Bool[np.ndarray, "h w"]]:
     """The camera's own mask with those of some pictures; none where none is given."""
     pictures = [one for one in recording.pictures if one.camera == camera.name and one.mask is not None]
-    paths = [pictures[index].mask for index in dict.fromkeys(spread_over(len(pictures), _PICTURES))] if pictures else []
+    paths = [pictures[index].mask for index in spread_over(len(pictures), _PICTURES)]
     read = [None if path is None else read_if_whole(partial(read_camera_mask, path, camera.camera)) for path in paths]
     of_pictures = [mask for mask in read if mask is not None]
     if camera.ego_mask is None:
@@ -74,10 +74,8 @@ def _change(
     """How much more what is hidden changes over the drive than what is used; None if that cannot be told."""
     pictures = [one for one in recording.pictures if one.camera == camera.name]
     factor = max(1, round(max(mask.shape) / _WORKING_PX))
-    read = [
-        read_if_whole(partial(read_image, pictures[index].path))
-        for index in dict.fromkeys(spread_over(len(pictures), _PICTURES))
-    ]
+    chosen = [pictures[index] for index in spread_over(len(pictures), _PICTURES)]
+    read = [read_if_whole(partial(read_image, picture.path)) for picture in chosen]
     contrasts = [_contrast(downscale_image(one, factor)) for one in read if one is not None]
     if len(contrasts) < 3:
         return None

@@ -26,14 +26,13 @@ from rich.console import Console
 
 from edge_depth_nerf.base.checked_cache import content_of, write_checked
 from edge_depth_nerf.base.console import progress_bars, run_jobs, say
-from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, load_archive
-from edge_depth_nerf.cameras.transforms import opencv_to_opengl
+from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, load_archive, sha256_of
 from edge_depth_nerf.scene.format import OWN_MOTION
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 from edge_depth_nerf.stereo.consistency import LEAST_AGREEING, MotionDistance, seen_around
 from edge_depth_nerf.stereo.motion import Motion
-from edge_depth_nerf.stereo.sweep import Swept
+from edge_depth_nerf.stereo.sweep import Swept, padded
 from edge_depth_nerf.stereo.views import View, view_of, working_factor
 
 VERSION = 1
@@ -111,11 +110,7 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
 
 def scene_view(scene: SceneFolder, picture: ScenePicture) -> View:
     """A scene's picture as the sweep wants it."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = picture.rotation, picture.position_m
-    # its own inverse: back to OpenCV's axes
-    pose = opencv_to_opengl(pose)
-    return view_of(scene.rgb(picture), scene.usable(picture), picture.lens, pose, scene.theta_max_rad)
+    return view_of(scene.rgb(picture), scene.usable(picture), picture.lens, picture.pose, scene.theta_max_rad)
 
 
 def enlarged(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
@@ -129,19 +124,14 @@ def enlarged(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float
     between = np.asarray(cv2.resize(inverse, whole, interpolation=cv2.INTER_LINEAR))
     # comparisons with NaN are false
     inverse = np.where(np.abs(between - nearest) <= _SMOOTH * nearest, between, nearest)
-    return _padded(np.nan_to_num(1 / inverse), size)
+    return padded(np.nan_to_num(1 / inverse), size, 0.0)
 
 
 def enlarged_sigma(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
     """Bring the distances' standard deviations to a picture's size (height, width): the nearest; 0 = none."""
-    result = _padded(found.sigma_m.repeat(factor, 0).repeat(factor, 1), size)
+    result = padded(found.sigma_m.repeat(factor, 0).repeat(factor, 1), size, 0.0)
     # a file has steps, the least of which still says that there is one
     return np.where(result > 0, np.maximum(result, np.float32(1 / DISTANCE_STEPS_PER_METRE)), result)
-
-
-def _padded(map_: Float32[np.ndarray, "_ _"], size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
-    """Add what fills no block at the right and at the bottom, as 0."""
-    return np.pad(map_, [(0, whole - there) for whole, there in zip(size, map_.shape, strict=True)])
 
 
 class SphereSweepCache:
@@ -196,19 +186,15 @@ def _write(path: Path, maps: Swept | MotionDistance) -> None:
     """Keep maps of a picture."""
     archive = io.BytesIO()
     np.savez(archive, **{field.name: getattr(maps, field.name) for field in dataclasses.fields(maps)})
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_checked(path, VERSION, lambda file: file.write(archive.getbuffer()))
 
 
 def _made_of(scene: SceneFolder, pictures: list[ScenePicture]) -> str:
     """Key of pictures, masks, lenses and poses: by what is in the files, since each run writes masks again."""
     digest = hashlib.sha256(repr(scene.theta_max_rad).encode())
-    contents: dict[Path, str] = {}
+    content = functools.cache(sha256_of)
     for picture in pictures:
-        files = [picture.files[layer] for layer in ("image", "mask") if layer in picture.files]
-        for path in files:
-            if path not in contents:
-                contents[path] = hashlib.sha256(path.read_bytes()).hexdigest()
+        contents = [content(picture.files[layer]) for layer in ("image", "mask") if layer in picture.files]
         pose = picture.rotation.tolist(), picture.position_m.tolist()
-        digest.update(repr((picture.name, [contents[path] for path in files], picture.lens, pose)).encode())
+        digest.update(repr((picture.name, contents, picture.lens, pose)).encode())
     return digest.hexdigest()[:16]

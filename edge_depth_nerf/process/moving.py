@@ -38,9 +38,10 @@ from edge_depth_nerf.lidar.moving import (
 )
 from edge_depth_nerf.lidar.world import WorldSweep
 from edge_depth_nerf.masks.lens import lens_circle
-from edge_depth_nerf.masks.moving import clearest_edge, grow_moving, larger_again, smaller, working_factor
+from edge_depth_nerf.masks.moving import clearest_edge, grow_moving
+from edge_depth_nerf.masks.regions import enlarge, working_factor
 from edge_depth_nerf.process.options import ProcessOptions
-from edge_depth_nerf.process.reading import downscale_mask, read_if_whole
+from edge_depth_nerf.process.reading import downscale_image, downscale_mask, read_if_whole
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.process.sweep_store import Scanner, SweepStore, elevation_rad
 
@@ -211,9 +212,9 @@ def _write_mask(
             if image is None:
                 # once it is mended, it gets a mask
                 return
-            image = smaller(image, factor)
+            image = downscale_image(image, factor)
             grown = _moving_pixels(image, camera, usable, recording.pose(picture), picture.time_s, things, seen)
-            moving |= larger_again(grown, factor, (full.height, full.width))
+            moving |= enlarge(grown, factor, (full.height, full.width))
     write_mask(path, ~moving)
 
 

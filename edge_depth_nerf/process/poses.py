@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from edge_depth_nerf.base.bounds import MAX_TIME_S, shown, text_lines
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json
-from edge_depth_nerf.cameras.transforms import Transform, check_rigid
+from edge_depth_nerf.cameras.transforms import Transform, check_rigid, rigid
 
 QUATERNION_TOLERANCE = 1e-3
 """How far a quaternion's length may be from 1; four written digits still pass."""
@@ -72,6 +72,12 @@ def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarr
     if len(doubled) > max(DOUBLED_SHARE * len(times), len(times) >= FEW_POSES):
         raise InputError(doubled[0][1])
     return np.array(times, np.float64), np.array(poses, np.float64).reshape(-1, 4, 4), [line for line, _ in doubled]
+
+
+def tum_text(times_s: Float64[np.ndarray, "poses"], poses: Float64[np.ndarray, "poses 4 4"]) -> str:
+    """Poses, at least one, in TUM's format."""
+    rows = np.column_stack((times_s, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()))
+    return "".join(" ".join(f"{value:.9f}" for value in row) + "\n" for row in rows)
 
 
 def _same(pose: Transform, other: Transform) -> bool:
@@ -203,9 +209,7 @@ def pose_of_quaternion(translation: list[float], quaternion: list[float], where:
             f"{where}: the quaternion {' '.join(f'{value:g}' for value in quaternion)} has the length {length:.4g}, so "
             "it is not a rotation; expected qx qy qz qw (w last) of length 1."
         )
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-    pose[:3, 3] = translation
+    pose = rigid(Rotation.from_quat(quaternion).as_matrix(), translation)
     check_rigid(pose, where)
     return pose
 

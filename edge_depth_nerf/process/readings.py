@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.cameras.transforms import Transform, rigid
 from edge_depth_nerf.lidar.trajectory import Trajectory
 
 CLEAR, CLEAR_SMALL = 0.35, 0.2
@@ -67,9 +67,7 @@ class Reading:
 
 
 def _turned(axis: str, degrees: float) -> Transform:
-    found = np.eye(4)
-    found[:3, :3] = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
-    return found
+    return rigid(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
 
 
 def _after(change: Transform) -> Change:
@@ -87,8 +85,7 @@ def _axes() -> list[tuple[Transform, str]]:
     found = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
-            change = np.eye(4)
-            change[:3, :3] = np.eye(3)[list(order)] * np.array(signs)[:, None]
+            change = rigid(np.eye(3)[list(order)] * np.array(signs)[:, None])
             if not np.array_equal(change, np.eye(4)):
                 found.append((change, _axes_said(change[:3, :3])))
     return found
@@ -216,16 +213,13 @@ def of_scans() -> list[Reading]:
 
 def of_maps() -> list[Reading]:
     """Other kinds and units of depth maps."""
-
-    def as_z(far: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-        return far / cosine.clip(0.05)
-
-    def as_distance(far: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-        return far * cosine.clip(0.05)
-
     return [
-        Reading("the depth maps of {name} hold z_depth: set kind", to_distance=as_z),
-        Reading("the depth maps of {name} hold distance: set kind", to_distance=as_distance),
+        Reading(
+            "the depth maps of {name} hold z_depth: set kind", to_distance=lambda far, cosine: far / cosine.clip(0.05)
+        ),
+        Reading(
+            "the depth maps of {name} hold distance: set kind", to_distance=lambda far, cosine: far * cosine.clip(0.05)
+        ),
         *(_longer(logarithm) for logarithm in _FACTORS),
     ]
 

@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, IMAGE_SUFFIXES, as_people_count, largest_of_16_bits
-from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.cameras.transforms import Transform, rigid
 from edge_depth_nerf.lidar import Sweep, transform_points
 from edge_depth_nerf.lidar.scans import SCAN_SUFFIXES, check_scan, read_scan
 from edge_depth_nerf.lidar.sweeps import usable_points
@@ -418,10 +418,8 @@ def _path(
         return upright @ moved
 
     vehicle_to_world = in_metres(sensor_to_world) @ np.linalg.inv(to_vehicle)
-    try:
+    with found_in(str(poses.file)):
         path = Trajectory(times, vehicle_to_world)
-    except InputError as error:
-        raise InputError(f"{poses.file}: {error}") from None
     return path, {file: in_metres(pose) for file, pose in of_pictures.items()}
 
 
@@ -482,9 +480,7 @@ def upright_world(up: str) -> Transform:
     """The turn of the world that makes its upward axis z; axes are exchanged, nothing more."""
     axes, axis = np.eye(3), "xyz".index(up[-1])
     upward, forward = axes[axis] * (-1.0 if up.startswith("-") else 1.0), axes[(axis + 1) % 3]
-    turn = np.eye(4)
-    turn[:3, :3] = np.stack((forward, np.cross(upward, forward), upward))
-    return turn
+    return rigid(np.stack((forward, np.cross(upward, forward), upward)))
 
 
 def _check_clocks(rig: Rig, files: dict[str, list[_Timed]], scans: Sequence[_Scans], path: Trajectory | None) -> None:

@@ -33,7 +33,7 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from edge_depth_nerf.base.bounds import MAX_TIME_S, path_inside, read_text, shown
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.calibration_file import MODELS, OF_MODEL, RATIONAL, parse_toml, read_lens
 from edge_depth_nerf.cameras.transforms import Transform
@@ -274,10 +274,8 @@ class RigCamera(_Sensor):
         assert self.calibration is not None
         if twice := self.model_fields_set & {*_LENS, *_LENS_NUMBERS, "pixel_centre"}:
             raise InputError(f".{min(twice)}: the calibration file describes the lens; remove one of them.")
-        try:
+        with found_in(".calibration"):
             return read_lens(self.calibration.file, self.calibration.camera)
-        except InputError as error:
-            raise InputError(f".calibration: {error}") from None
 
     def _of_numbers(self) -> Camera:
         assert self.model and self.width and self.height and self.cx is not None and self.cy is not None
@@ -293,7 +291,7 @@ class RigCamera(_Sensor):
         if lacking := [key for key in own if key in OF_MODEL and getattr(self, key) is None]:
             raise InputError(f".{lacking[0]} is missing; expected a number.")
         shift = 0.5 - self.pixel_centre
-        try:
+        with found_in(".model"):
             return kind(
                 width=self.width,
                 height=self.height,
@@ -303,8 +301,6 @@ class RigCamera(_Sensor):
                 cy=self.cy + shift,
                 **{key: getattr(self, key) for key in own},
             )
-        except InputError as error:
-            raise InputError(f".model: {error}") from None
 
     @model_validator(mode="after")
     def _check(self) -> RigCamera:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from numpy.lib.recfunctions import unstructured_to_structured
 
 from edge_depth_nerf.base.files import read_npz, write_atomically, write_bytes
 from edge_depth_nerf.lidar.ply import ply_bytes
@@ -65,11 +66,7 @@ def write_part(
     # before the shift float32 would round to fractions of a millimetre, or to centimetres far from the origin
     points_m = (cloud.points_m[used] - world_offset_m).astype(np.float32)
     part = _thinned([_Part(points_m, cloud.colours[used])], VOXEL_M)
-
-    def write(temporary: Path) -> None:
-        np.savez(temporary, points_m=part.points_m, colours=part.colours)
-
-    write_atomically(path, write)
+    write_atomically(path, lambda temporary: np.savez(temporary, points_m=part.points_m, colours=part.colours))
 
 
 def merge_parts(parts: Sequence[Path], ply: Path) -> int:
@@ -100,7 +97,5 @@ def merge_parts(parts: Sequence[Path], ply: Path) -> int:
 
 def _ply(part: _Part) -> bytes:
     kinds = {"x": "<f4", "y": "<f4", "z": "<f4", "red": "u1", "green": "u1", "blue": "u1"}
-    rows = np.empty(len(part.points_m), dtype=list(kinds.items()))
-    for column, name in enumerate(kinds):
-        rows[name] = part.points_m[:, column] if column < 3 else part.colours[:, column - 3]
-    return ply_bytes(rows)
+    columns = np.hstack((part.points_m, part.colours))
+    return ply_bytes(unstructured_to_structured(columns, np.dtype(list(kinds.items()))))

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy.typing import NDArray
 
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.base.files import (
     DISTANCE_STEPS_PER_METRE,
     read_distance_png,
@@ -29,6 +29,7 @@ from edge_depth_nerf.base.files import (
 )
 from edge_depth_nerf.cameras import KannalaBrandt, Pinhole
 from edge_depth_nerf.cameras.rays import Rays, distance_from_z_depth, rays
+from edge_depth_nerf.cameras.transforms import Transform, opencv_to_opengl, rigid
 from edge_depth_nerf.lidar.scans import read_cloud
 from edge_depth_nerf.scene.format import (
     CHECKS,
@@ -77,6 +78,11 @@ class ScenePicture:
     def __deepcopy__(self, memo: dict[int, Any]) -> ScenePicture:
         # nothing in it changes, and nerfstudio's dataset copies all that it is given
         return self
+
+    @property
+    def pose(self) -> Transform:
+        """Camera (OpenCV: x right, y down, z forward) to scene."""
+        return opencv_to_opengl(rigid(self.rotation, self.position_m))
 
     @property
     def looks_along(self) -> Float64[np.ndarray, "3"]:
@@ -155,6 +161,11 @@ class SceneFolder:
     def folder(self) -> Path:
         """Where its files are relative to."""
         return self.path.parent
+
+    @property
+    def world_offset_m(self) -> Float64[np.ndarray, "3"]:
+        """The scene's origin in the recording's world."""
+        return np.array(self.meta.get("world_offset_m", [0.0, 0.0, 0.0]), np.float64)
 
     def cameras(self) -> dict[str, tuple[ScenePicture, ...]]:
         """The pictures of each camera, in order of their frames."""
@@ -419,12 +430,10 @@ def _lens(meta: dict[str, Any], frame: dict[str, Any], model: str, path: Path) -
     distortion = [number_of(value, f"{where}: {key}") for key, value in zip(DISTORTION, values, strict=True)]
     width, height, fx, fy, cx, cy = size_and_focal
     k1, k2, k3, k4, p1, p2 = distortion
-    try:
+    with found_in(where):
         if model == FISHEYE_MODEL:
             return KannalaBrandt(int(width), int(height), fx, fy, cx, cy, k1, k2, k3, k4, p1, p2)
         return Pinhole(int(width), int(height), fx, fy, cx, cy, k1, k2, p1, p2, k3, k4)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
 
 
 def _files(frame: dict[str, Any], folder: Path, own_lidar: bool) -> dict[str, Path]:

@@ -7,8 +7,8 @@ sweeps, in order of time.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -122,22 +122,14 @@ class SceneScanner:
 
     def entry(self, folder: Path) -> dict[str, Any]:
         """Describe it for transforms.json, in a scene's folder."""
-        timing = None
-        if self.timing is not None:
-            timing = {entry.name: getattr(self.timing, entry.name) for entry in fields(SweepTiming)}
+        timing = None if self.timing is None else asdict(self.timing)
         return {"timing": timing, "sweeps": [sweep.entry(folder) for sweep in self.sweeps]}
 
 
 def write_rays(path: Path, rays: SweepRays) -> None:
     """Write a sweep's rays, compressed, atomically."""
     arrays = {entry.name: getattr(rays, entry.name) for entry in fields(SweepRays)}
-
-    def write(temporary: Path) -> None:
-        # given a name, NumPy would add .npz to it
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, **arrays)
-
-    write_atomically(path, write)
+    write_atomically(path, lambda temporary: np.savez_compressed(temporary, **arrays))
 
 
 def scanners_of(meta: Mapping[str, Any], path: Path) -> dict[str, SceneScanner]:
@@ -188,8 +180,3 @@ def _timing(entry: object, where: str) -> SweepTiming | None:
         return None
     turn_s, reference = (number_of(entry.get(key), f"{where}: {key}") for key in ("turn_s", "reference_azimuth_rad"))
     return SweepTiming(turn_s, entry.get("clockwise") is True, reference)
-
-
-def entries(scanners: Sequence[SceneScanner], folder: Path) -> dict[str, Any]:
-    """Describe scanners for transforms.json."""
-    return {scanner.name: scanner.entry(folder) for scanner in scanners}

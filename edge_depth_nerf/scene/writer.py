@@ -68,7 +68,7 @@ from edge_depth_nerf.scene.format import (
     read_transforms,
 )
 from edge_depth_nerf.scene.points import PointCloud, merge_parts, write_part
-from edge_depth_nerf.scene.sweeps import SCANNERS, SceneScanner, entries
+from edge_depth_nerf.scene.sweeps import SCANNERS, SceneScanner
 
 RECORD = "process.json"
 LEFT_OUT = "left_out.json"
@@ -293,7 +293,7 @@ def write_scene(
         _write_cloud(output, frames)
     content = _transforms(cameras, fits, frames, shifted, layers, offset, theta_max_deg, source)
     if scanners:
-        content[SCANNERS] = entries(scanners, output)
+        content[SCANNERS] = {scanner.name: scanner.entry(output) for scanner in scanners}
     for name, maps in later.items():
         content[name] = maps.entry
         for frame in content["frames"]:

@@ -35,6 +35,7 @@ from rich.console import Console
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import check_is_folder, read_json, write_json, write_mask, write_text
+from edge_depth_nerf.cameras.transforms import rigid
 from edge_depth_nerf.synthetic import rig
 from edge_depth_nerf.synthetic.layout import WORLD_ORIGIN_M, DriveLayout, MountedCamera
 from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S
@@ -43,8 +44,6 @@ from edge_depth_nerf.synthetic.rig_drive import RIG_FILE_LAYOUTS
 
 VERSION = 1
 """Version of what is synthesised: drives of different versions do not mix in one folder."""
-
-"""How far the held-out views are moved to the car's left."""
 
 _MANIFEST = "drive.json"
 _FIRST_TIME = datetime(2013, 5, 28, 8, 46, 2)
@@ -170,8 +169,7 @@ class _Kitti360(DriveLayout):
         rig.write_calibration(self.root / "calibration", self.options.size)
         for folder in (*(self._pictures / name for name in self.cameras), self._scans):
             write_text(folder / "timestamps.txt", _timestamps(self.options.frames))
-        to_world = np.eye(4)
-        to_world[:3, 3] = WORLD_ORIGIN_M
+        to_world = rigid(np.eye(3), WORLD_ORIGIN_M)
         poses = to_world @ self.drive.pose_to_world(np.array(frames) * FRAME_INTERVAL_S)
         folder = self.root / "data_poses" / self.options.sequence
         write_text(folder / "poses.txt", "".join(_row(frame, poses[frame][:3]) for frame in frames))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.base.files import write_bytes, write_distance_png, write_mask, write_png
 from edge_depth_nerf.cameras import Camera
+from edge_depth_nerf.cameras.transforms import rigid
 from edge_depth_nerf.synthetic.lidar import HDL_64E, Scanner, Sweep, sweep
 from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
@@ -135,8 +136,7 @@ class DriveLayout(ABC):
 
     def camera_pose(self, name: str, time_s: float, to_the_left_m: float = 0.0) -> NDArray[np.float64]:
         """Camera to scene, 4×4, with the whole car moved to its left."""
-        sideways = np.eye(4)
-        sideways[1, 3] = -to_the_left_m
+        sideways = rigid(np.eye(3), (0.0, -to_the_left_m, 0.0))
         return self.drive.pose_to_world(np.array([time_s]))[0] @ sideways @ self.cameras[name].to_pose
 
     def write(self, frame: int, name: str | None) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from edge_depth_nerf.cameras.transforms import rigid
 from edge_depth_nerf.synthetic.geometry import Geometry, Pair, Real
 from edge_depth_nerf.synthetic.rig import POSE_HEIGHT_M
 
@@ -139,10 +140,8 @@ class Drive:
         # turning by heading, then pitch, then roll; the pose's y and z axes point right and down
         forward = np.stack((ch * cp, sh * cp, sp), -1)
         left = np.stack((-sh * cr - ch * sp * sr, ch * cr - sh * sp * sr, cp * sr), -1)
-        poses = np.zeros((*t.shape, 4, 4))
-        poses[..., :3, :3] = np.stack((forward, -left, np.cross(forward, -left)), -1)
-        poses[..., :2, 3], poses[..., 2, 3], poses[..., 3, 3] = position, height, 1
-        return poses
+        rotation = np.stack((forward, -left, np.cross(forward, -left)), -1)
+        return rigid(rotation, np.concatenate((position, height[..., None]), -1))
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.base.files import write_mask, write_text
 from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole
+from edge_depth_nerf.cameras.transforms import rigid
 from edge_depth_nerf.synthetic.layout import VEHICLE_TO_POSE, WORLD_ORIGIN_M, DriveLayout, MountedCamera
 from edge_depth_nerf.synthetic.lidar import Scanner, Sweep
 from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S
@@ -54,13 +55,7 @@ def looking(yaw_deg: float, pitch_deg: float, position_m: tuple[float, float, fl
     yaw, pitch = math.radians(yaw_deg), math.radians(pitch_deg)
     forward = np.array([math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), -math.sin(pitch)])
     right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
-    return _transform(np.stack((right, np.cross(forward, right), forward), -1), position_m)
-
-
-def _transform(rotation: NDArray[np.float64], translation_m: tuple[float, float, float]) -> NDArray[np.float64]:
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = rotation, translation_m
-    return transform
+    return rigid(np.stack((right, np.cross(forward, right), forward), -1), position_m)
 
 
 def _mounted(camera: Camera, to_vehicle: NDArray[np.float64], theta_deg: float, delay_s: float = 0.0) -> MountedCamera:
@@ -105,7 +100,7 @@ def _filled(camera: Camera, theta_deg: float) -> Camera:
 
 def _scanner_to_vehicle(yaw_deg: float, position_m: tuple[float, float, float]) -> NDArray[np.float64]:
     """Scanner to vehicle, 4×4."""
-    return _transform(Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix(), position_m)
+    return rigid(Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix(), position_m)
 
 
 class _RigFileLayout(DriveLayout):

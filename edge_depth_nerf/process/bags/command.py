@@ -50,7 +50,6 @@ from edge_depth_nerf.process.bags.frames import (
     mounting,
     name_of,
     path_of,
-    rows_of,
 )
 from edge_depth_nerf.process.bags.lenses import Lens
 from edge_depth_nerf.process.bags.options import UnpackOptions
@@ -67,6 +66,7 @@ from edge_depth_nerf.process.bags.survey import (
     stamp_of,
     window,
 )
+from edge_depth_nerf.process.poses import tum_text
 from edge_depth_nerf.process.rig_file import TODO
 
 _MANIFEST, _RIG, _POSES = "unpack.json", "rig.toml", "poses.txt"
@@ -192,9 +192,10 @@ class _Unpacking:
     def write(self) -> None:
         """Read the bag and write the recording."""
         found = self._found
+        special = {TF: self._take_tf, FIX: self._take_fix, IMU: self._take_imu}
         takers: dict[str, Callable[[int, Any], None]] = {}
         for topic in (*(topic for topic in self._bag.topics if topic.type == TF), *found.poses):
-            takers[topic.name] = self._taker_of(topic.type)
+            takers[topic.name] = special.get(topic.type, self._take_pose)
         takers |= {camera.topic.name: partial(self._take_picture, camera) for camera in found.cameras}
         takers |= {scanner.topic.name: partial(self._take_scan, scanner) for scanner in found.scanners}
         start_ns, end_ns = window(self._bag, self._options)
@@ -269,10 +270,6 @@ class _Unpacking:
                 say(self._console, said, "yellow")
 
     # ---- poses -------------------------------------------------------------------------------------------------
-
-    def _taker_of(self, type_: str) -> Callable[[int, Any], None]:
-        special = {TF: self._take_tf, FIX: self._take_fix, IMU: self._take_imu}
-        return special.get(type_, self._take_pose)
 
     def _take_tf(self, _: int, message: Any) -> None:
         for each in message.transforms:
@@ -389,7 +386,7 @@ class _Unpacking:
                 "yellow",
             )
             return None
-        write_text(self._output / _POSES, "".join(rows_of(times_s, poses)))
+        write_text(self._output / _POSES, tum_text(times_s, poses))
         return said
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation, Slerp
 
-from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.cameras.transforms import Transform, rigid
 from edge_depth_nerf.lidar.trajectory import Trajectory
 
 Edge = tuple[str, str]
@@ -69,20 +69,9 @@ class Poses:
 
 def matrices(table: Float64[np.ndarray, "poses 8"]) -> Float64[np.ndarray, "poses 4 4"]:
     """Poses as transforms."""
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    if len(table):
-        poses[:, :3, :3] = Rotation.from_quat(table[:, 4:]).as_matrix()
-        poses[:, :3, 3] = table[:, 1:4]
-    return poses
-
-
-def rows_of(times_s: Float64[np.ndarray, "poses"], poses: Float64[np.ndarray, "poses 4 4"]) -> list[str]:
-    """Lines of TUM's format."""
-    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat() if len(poses) else np.empty((0, 4))
-    return [
-        f"{time:.9f} {' '.join(f'{value:.9f}' for value in (*pose[:3, 3], *quaternion))}\n"
-        for time, pose, quaternion in zip(times_s, poses, quaternions, strict=True)
-    ]
+    if not len(table):
+        return np.empty((0, 4, 4))
+    return rigid(Rotation.from_quat(table[:, 4:]).as_matrix(), table[:, 1:4])
 
 
 def chain(edges: Sequence[Edge], source: str, target: str) -> list[tuple[Edge, bool]] | None:
@@ -179,8 +168,6 @@ def by_satellite(
             [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
         ]
     )
-    poses = np.tile(np.eye(4), (len(fixes), 1, 1))
     imu_to_world = Slerp(turns[:, 0], Rotation.from_quat(turns[:, 1:]))(fixes[:, 0]).as_matrix()
-    poses[:, :3, :3] = imu_to_world @ imu_to_vehicle[:3, :3].T
-    poses[:, :3, 3] = (earth - earth[0]) @ axes.T - poses[:, :3, :3] @ antenna_to_vehicle[:3, 3]
-    return fixes[:, 0], poses
+    turn = imu_to_world @ imu_to_vehicle[:3, :3].T
+    return fixes[:, 0], rigid(turn, (earth - earth[0]) @ axes.T - turn @ antenna_to_vehicle[:3, 3])

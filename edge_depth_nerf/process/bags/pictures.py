@@ -140,10 +140,14 @@ def _checked(content: bytes) -> bytes:
 
 def _developed(content: bytes, code: int) -> NDArray[np.uint8]:
     """A compressed Bayer mosaic in colours."""
-    mosaic = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if mosaic is None:
+    return _converted(_decoded(content, cv2.IMREAD_GRAYSCALE), code)
+
+
+def _decoded(content: bytes, how: int) -> NDArray:
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), how)
+    if picture is None:
         raise InputError(f"{len(content)} bytes that cannot be decoded as a picture")
-    return _converted(mosaic, code)
+    return picture
 
 
 def size_of(message: Any) -> tuple[int, int]:
@@ -154,7 +158,5 @@ def size_of(message: Any) -> tuple[int, int]:
     """
     if hasattr(message, "encoding"):
         return message.width, message.height
-    picture = cv2.imdecode(np.frombuffer(message.data.tobytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-    if picture is None:
-        raise InputError(f"{len(message.data)} bytes that cannot be decoded as a picture")
+    picture = _decoded(message.data.tobytes(), cv2.IMREAD_UNCHANGED)
     return picture.shape[1], picture.shape[0]

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.process.bags.survey import FoundCamera, FoundScanner
 from edge_depth_nerf.process.rig_file import TODO
@@ -77,16 +75,10 @@ def _lens_lines(camera: FoundCamera) -> list[str]:
         lacking += [(key, "principal point in pixels") for key in ("cx", "cy")]
         named = [_todo(key, what) for key, what in lacking]
         return [f"# {camera.lens}; calibrate it, and add its distortion (k1 …)", *size, *named]
-    numbers = [
-        f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}"
-        for key, value in ((key, _plain(value)) for key, value in camera.lens.keys.items())
-    ]
+    # NumPy's numbers are written otherwise
+    plain = {key: value if isinstance(value, (str, int)) else float(value) for key, value in camera.lens.keys.items()}
+    numbers = [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}" for key, value in plain.items()]
     return ([f"# {camera.lens.note}"] if camera.lens.note else []) + numbers
-
-
-def _plain(value: str | int | float) -> str | int | float:
-    """Without NumPy's types, which TOML does not know."""
-    return value if isinstance(value, (str, int)) else float(value)
 
 
 def _turn_lines(scanner: FoundScanner) -> list[str]:
@@ -111,13 +103,9 @@ def _mounting_lines(mounted: Mounted, vehicle: str) -> list[str]:
     if mounted.to_vehicle is None:
         what = f"4 rows of 4 numbers, from its frame ({mounted.frame or 'without name'}) to the vehicle's ({vehicle})"
         return [_todo("to_vehicle", what)]
-    rows = [f"    [{', '.join(f'{value:.12g}' for value in _floats(row))}]," for row in mounted.to_vehicle]
-    return ["to_vehicle = [", *rows, "]"]
-
-
-def _floats(row: np.ndarray) -> list[float]:
     # chains leave the last digits unsure; -0.0 is written as 0
-    return [round(float(value), 12) + 0.0 for value in row]
+    numbers = [[round(float(value), 12) + 0.0 for value in row] for row in mounted.to_vehicle]
+    return ["to_vehicle = [", *(f"    [{', '.join(f'{value:.12g}' for value in row)}]," for row in numbers), "]"]
 
 
 def looks_upward(to_vehicle: Transform) -> bool:

@@ -27,9 +27,8 @@ from edge_depth_nerf.process.bags.pictures import bits_used, size_of, why_no_pic
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CLOUD, INFO, TF = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
-ODOMETRY = "nav_msgs/msg/Odometry"
 POSES = (
-    ODOMETRY,
+    "nav_msgs/msg/Odometry",
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped",
@@ -90,10 +89,6 @@ class Survey:
     """Of one source: poses, /tf, or fixes with an IMU."""
     taken: dict[str, str] = field(default_factory=dict)
     """By topic: what it is taken for, or why it is not."""
-
-    def topic(self, type_: str) -> Topic | None:
-        """The chosen source of poses, if it is of a type."""
-        return next((topic for topic in self.poses if topic.type == type_), None)
 
 
 def stamp_of(message: Any, recorded_ns: int) -> int:

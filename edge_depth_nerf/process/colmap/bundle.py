@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from edge_depth_nerf.cameras import Camera
-from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.cameras.transforms import Transform, rigid
 from edge_depth_nerf.poses.tracks import Tracks
 from edge_depth_nerf.process.colmap.models import colmap_lens
 
@@ -66,8 +66,7 @@ def adjust_bundle(
     The search begins with the poses `start`, and with `points`, the places of what `tracks` see. Tracks count `shots`.
     """
     # COLMAP works best near the origin
-    origin = np.eye(4)
-    origin[:3, 3] = given[:, :3, 3].mean(0)
+    origin = rigid(np.eye(3), given[:, :3, 3].mean(0))
     shift = np.linalg.inv(origin)
     bundle = _Bundle(pycolmap, shots, shift @ start, shift @ given, softness)
     bundle.add_points(tracks, points - origin[:3, 3])
@@ -196,6 +195,5 @@ class _Bundle:
 
 def _looking_along(axis: Float64[np.ndarray, "3"]) -> Transform:
     """From the vehicle to a camera at its origin that looks along an axis."""
-    found, x = np.eye(4), np.roll(axis, 1)
-    found[:3, :3] = np.stack((x, np.cross(axis, x), axis))
-    return found
+    x = np.roll(axis, 1)
+    return rigid(np.stack((x, np.cross(axis, x), axis)))

@@ -26,7 +26,7 @@ from rich.console import Console
 
 from edge_depth_nerf.base.bounds import finite
 from edge_depth_nerf.base.console import progress_bars
-from edge_depth_nerf.base.files import read_image, read_json, write_json
+from edge_depth_nerf.base.files import read_image, read_json, sha256_of, write_json
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.matches import Matches, PosedPicture, epipolar_distance_px, match_pictures
@@ -172,18 +172,16 @@ def _digest(
     version: str, recording: Recording, options: ProcessOptions, given: Float64[np.ndarray, "frames 4 4"]
 ) -> str:
     """Of everything that the refined poses depend on, pictures and masks by size and time of change."""
-    cameras = [[c.name, c.camera.to_dict(), c.to_vehicle.tolist(), _content(c.ego_mask)] for c in recording.cameras]
+    cameras = [
+        [c.name, c.camera.to_dict(), c.to_vehicle.tolist(), None if c.ego_mask is None else sha256_of(c.ego_mask)]
+        for c in recording.cameras
+    ]
     pictures = [
         [p.camera, p.frame, recording.pose(p).tolist(), *map(_stamp, (p.path, p.mask, p.semantics))]
         for p in recording.pictures
     ]
     rest = [_VERSION, version, given.tolist(), options.theta_max_deg, options.moving_classes, *options.holdout_cameras]
     return hashlib.sha256(json.dumps([cameras, pictures, rest]).encode()).hexdigest()
-
-
-def _content(path: Path | None) -> str | None:
-    """What a small file holds, wherever it lies."""
-    return None if path is None else hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _stamp(path: Path | None) -> list | None:

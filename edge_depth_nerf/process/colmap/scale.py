@@ -25,7 +25,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import rays
-from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.cameras.transforms import Transform, rigid
 from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.lidar.world import sweep_in_world
@@ -184,10 +184,8 @@ def _vehicle_poses(
 def _mean_pose(poses: Sequence[Transform]) -> Transform:
     if len(poses) == 1:
         return poses[0]
-    mean = np.eye(4)
-    mean[:3, :3] = Rotation.from_matrix([pose[:3, :3] for pose in poses]).mean().as_matrix()
-    mean[:3, 3] = np.mean([pose[:3, 3] for pose in poses], axis=0)
-    return mean
+    turn = Rotation.from_matrix([pose[:3, :3] for pose in poses]).mean().as_matrix()
+    return rigid(turn, np.mean([pose[:3, 3] for pose in poses], axis=0))
 
 
 def _similarity(
@@ -204,10 +202,7 @@ def _similarity(
     extent = float((centred**2).sum())
     if factor is None:
         factor = float((centred * centred_goal).sum()) / extent if extent > 0 else 1.0
-    transform = np.eye(4)
-    transform[:3, :3] = turn
-    transform[:3, 3] = goal.mean(0) - factor * source.mean(0)
-    return factor, transform
+    return factor, rigid(turn, goal.mean(0) - factor * source.mean(0))
 
 
 def metric_path(recording: Recording, models: Sequence[ColmapModel]) -> tuple[MetricPath, Scale]:

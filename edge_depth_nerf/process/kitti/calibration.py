@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.base.bounds import shown, text_lines
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.cameras.transforms import Transform, check_rigid
+from edge_depth_nerf.cameras.transforms import Transform, check_rigid, rigid
 from edge_depth_nerf.process.poses import finite_number, transform_of_rows
 
 EARTH_RADIUS_M = 6378137.0
@@ -89,8 +89,7 @@ def read_rectification(values: Values, path: Path) -> Transform:
     Raises:
         InputError: it is missing, or no rotation.
     """
-    turn = np.eye(4)
-    turn[:3, :3] = _matrix(values, "R_rect_00", (3, 3), path)
+    turn = rigid(_matrix(values, "R_rect_00", (3, 3), path))
     check_rigid(turn, f"{path}: R_rect_00")
     return turn
 
@@ -106,8 +105,7 @@ def read_projection(values: Values, key: str, path: Path) -> RectifiedCamera:
     wrong = lens[2].tolist() != [0, 0, 1] or lens[0, 1] != 0 or lens[1, 0] != 0 or min(lens[0, 0], lens[1, 1]) <= 0
     if wrong:
         raise InputError(f"{path}: {key} is no projection of rectified pictures (fx 0 cx; 0 fy cy; 0 0 1). {_AGAIN}")
-    to_camera_0 = np.eye(4)
-    to_camera_0[:3, 3] = -np.linalg.solve(lens, column)
+    to_camera_0 = rigid(np.eye(3), -np.linalg.solve(lens, column))
     return RectifiedCamera(lens[0, 0], lens[1, 1], lens[0, 2], lens[1, 2], to_camera_0)
 
 
@@ -149,8 +147,6 @@ def read_oxts(folder: Path) -> dict[int, Transform]:
         place_m[2] = altitude
         if not poses:
             origin_m = place_m
-        poses[frame] = np.eye(4)
         # about x, then y, then z of the world
-        poses[frame][:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
-        poses[frame][:3, 3] = place_m - origin_m
+        poses[frame] = rigid(Rotation.from_euler("xyz", angles).as_matrix(), place_m - origin_m)
     return poses

@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.base.files import picture_head
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.trajectory import Trajectory
@@ -155,13 +155,11 @@ def _path(layout: _Layout) -> Trajectory:
             f"{layout.times_file}: ends after line {lines}, but {layout.poses_file} has a pose of frame {frames[-1]}, "
             f"which needs line {frames[-1] + 1}. The file is truncated; copy it again from the data set."
         )
-    try:
+    with found_in(str(layout.poses_file)):
         return Trajectory(
             np.array([layout.times_s[frame] for frame in frames], np.float64),
             np.array([poses[frame] for frame in frames], np.float64).reshape(-1, 4, 4),
         )
-    except InputError as error:
-        raise InputError(f"{layout.poses_file}: {error}") from None
 
 
 def _increasing(times_s: Sequence[float], path: Path) -> Sequence[float]:
