@@ -1,4 +1,4 @@
-"""No data makes this program run code, leave its folder, or load more than weights; see test_unsafe_calls.py, too."""
+"""No data makes this program run code, leave its folder, or load more than weights; see ruff's rules S and TID, too."""
 
 import ast
 import pickle
@@ -238,6 +238,12 @@ def test_a_rig_names_files_of_the_recording(tmp_path, key, name):
 
 
 # ---- the host ----------------------------------------------------------------------------------------------------
+def test_what_reads_data_is_told_not_to_run_it():
+    unsafe = re.compile(r"(allow_pickle|trust_remote_code\W+|shell) ?[=:] ?(?!False)|weights_only ?[=:] ?(?!True)")
+    assert unsafe.search("np.load(path, allow_pickle=asked)") and not unsafe.search("np.load(path, allow_pickle=False)")
+    assert not [path for path in PACKAGE.rglob("*.py") if unsafe.search(path.read_text(encoding="utf-8"))]
+
+
 def test_each_workaround_names_its_issue_and_its_end():
     found = [value for name, value in vars(compat).items() if getattr(value, "__module__", "") == compat.__name__]
     assert len(found) >= 3

@@ -38,7 +38,7 @@ def keep_sweeps(
 ) -> list[SceneScanner]:
     """Write the rays of the sweeps between the first picture and the last, those that are missing or out of date.
 
-    All are written anew if the sweeps or their poses are others than those of an earlier run.
+    All are written again if the sweeps or their poses are others than those of an earlier run.
 
     Args:
         recording: with a trajectory.
