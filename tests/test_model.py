@@ -204,6 +204,21 @@ def test_the_weight_of_the_depth_loss_falls_over_the_training():
         assert float(trained_step(model)[1]["edge_loss"]) == pytest.approx(expected * share, rel=1e-4)
 
 
+@pytest.mark.parametrize("sharp", [0.0, 0.02])
+def test_what_lidar_measured_keeps_its_weight(sharp):
+    model = build(depth_loss_mult=0.5, depth_loss_final=0.01, depth_loss_sharp=sharp)
+    model._training_steps = model._step = 100
+    supervision = batch()
+    known = supervision["prior_distance_m"]
+    measured = (torch.arange(16) % 2 == 0)[:, None]
+    supervision["prior_sigma_m"] = torch.where(measured, 0.019 * known + 0.02, 0.022 * known + 0.02)
+    outputs, losses = trained_step(model, supervision)
+    weights = torch.where(measured[:, 0] & (sharp > 0), 0.5, 0.005)
+    levels = [replace(each, sigma_m=supervision["prior_sigma_m"][:, 0]) for each in levels_of(outputs)]
+    expected = sum((weights * EdgeLoss()(each)).sum() for each in levels) / 12 / 3
+    assert float(losses["edge_loss"]) == pytest.approx(float(expected), rel=1e-5)
+
+
 def test_what_nothing_stops_has_the_colour_of_the_direction():
     """Empty space shows the field at infinity: the same from wherever the camera stands."""
     model, plain = build().eval(), build(sky_background=False).eval()
@@ -291,7 +306,7 @@ def test_losses_of_final_samples_alone():
     model.proposal_sampler.forward = lambda *given, **more: (propose(*given, **more)[0], [], [])
     outputs = model(rays(), supervision)
     (weights,) = outputs["weights_list"]
-    step = Step(outputs, supervision, model.planes, 0.0, 1.0)
+    step = Step(outputs, supervision, model.planes, 0.0, 1.0, 1.0)
     hit = weights[supervision["sky"][:, 0]].sum(dim=1).mean()
     assert float(model.step_losses["sky_loss"](step)) == pytest.approx(0.5 * float(hit), rel=1e-4)
     assert float(model.step_losses["edge_loss"](step)) > 0

@@ -183,7 +183,12 @@ def register(named: str) -> None:
             LOSSES[entry.name] = found
 
 
-def depth_loss(loss: DepthLoss, levels: Sequence[Level], count: int | None = None) -> Float[Tensor, ""]:
+def depth_loss(
+    loss: DepthLoss,
+    levels: Sequence[Level],
+    count: int | None = None,
+    weights: Float[Tensor, "rays"] | None = None,
+) -> Float[Tensor, ""]:
     """Compute a loss on the prior: mean over the rays, then over the levels.
 
     Args:
@@ -191,8 +196,10 @@ def depth_loss(loss: DepthLoss, levels: Sequence[Level], count: int | None = Non
         levels: of the same rays and prior. Those without a gradient would only add a number and may be left out, unless
             the loss wants them (`of_resting_levels`).
         count: how many levels there are; None: these.
+        weights: what the loss of each ray is multiplied by; None: 1.
     """
     prior_m = levels[0].prior_m
     rays = len(prior_m) if loss.over_all_rays else (prior_m > 0).sum().clamp(min=1)
-    per_level = [loss(level).sum() for level in levels]
+    per_ray = [loss(level) for level in levels]
+    per_level = [each.sum() if weights is None else (each * weights).sum() for each in per_ray]
     return sum(per_level[1:], per_level[0]) / (rays * (count or len(levels)))
