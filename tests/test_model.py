@@ -306,7 +306,7 @@ def test_losses_of_final_samples_alone():
     model.proposal_sampler.forward = lambda *given, **more: (propose(*given, **more)[0], [], [])
     outputs = model(rays(), supervision)
     (weights,) = outputs["weights_list"]
-    step = Step(outputs, supervision, model.planes, 0.0, 1.0, 1.0)
+    step = Step(outputs, supervision, model.planes, 0.0, 1.0)
     hit = weights[supervision["sky"][:, 0]].sum(dim=1).mean()
     assert float(model.step_losses["sky_loss"](step)) == pytest.approx(0.5 * float(hit), rel=1e-4)
     assert float(model.step_losses["edge_loss"](step)) > 0

@@ -184,10 +184,7 @@ def register(named: str) -> None:
 
 
 def depth_loss(
-    loss: DepthLoss,
-    levels: Sequence[Level],
-    count: int | None = None,
-    weights: Float[Tensor, "rays"] | None = None,
+    loss: DepthLoss, levels: Sequence[Level], count: int | None = None, weights: Float[Tensor, "rays"] | None = None
 ) -> Float[Tensor, ""]:
     """Compute a loss on the prior: mean over the rays, then over the levels.
 

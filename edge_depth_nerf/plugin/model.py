@@ -401,8 +401,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         else:
             losses = super().get_loss_dict(outputs, batch, metrics_dict)
         if self.training:
-            weights = self.config.depth_loss_mult, self.depth_weight()
-            step = Step(outputs, batch, self.planes, self._share_done(), *weights)
+            step = Step(outputs, batch, self.planes, self._share_done(), self.depth_weight())
             wanted = self.step_losses
             if "surface_rgb" not in outputs:
                 wanted.pop("surface_loss", None)

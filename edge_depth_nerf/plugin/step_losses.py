@@ -75,8 +75,6 @@ class Step:
     planes: Planes
     share_done: float
     """The share of the training that is behind, 0 to 1."""
-    first_depth_weight: float
-    """λ as it is at the start of the training."""
     depth_weight: float | Tensor
     """λ at this step."""
 
@@ -92,8 +90,10 @@ class PriorLoss:
     loss: DepthLoss
     final_alone: bool
     """Whether it applies to the final samples only, not to those of the proposal networks."""
+    mult: float = 0.0
+    """λ at the start of the training."""
     sharp: float = 0.0
-    """Rays whose σ̂ is at most this share of their distance, plus `SHARP_M`, keep the λ of the start. 0: none do."""
+    """Rays whose σ̂ is at most this share of their distance, plus `SHARP_M`, keep that λ. 0: none do."""
 
     def __call__(self, step: Step) -> Float[Tensor, ""]:
         """Give the weighted loss."""
@@ -116,7 +116,7 @@ class PriorLoss:
         if self.sharp <= 0:
             return step.depth_weight * depth_loss(self.loss, levels, len(every))
         sharp = sigma_m <= self.sharp * prior_m + SHARP_M
-        weights = torch.where(sharp, step.first_depth_weight, step.depth_weight)
+        weights = torch.where(sharp, self.mult, step.depth_weight)
         return depth_loss(self.loss, levels, len(every), weights)
 
 
@@ -170,9 +170,9 @@ def step_losses_of(config: Any) -> dict[str, StepLoss]:
     loss = getattr(config.losses, name.replace("-", "_"), None) or LOSSES[name]()
     losses: dict[str, StepLoss] = {}
     if config.depth_loss_mult > 0:
-        losses[f"{name.replace('-', '_')}_loss"] = PriorLoss(
-            loss, config.depth_loss_levels == "final", config.depth_loss_sharp if config.depth_loss_final < 1 else 0.0
-        )
+        final_alone, mult = config.depth_loss_levels == "final", config.depth_loss_mult
+        sharp = config.depth_loss_sharp if config.depth_loss_final < 1 else 0.0
+        losses[f"{name.replace('-', '_')}_loss"] = PriorLoss(loss, final_alone, mult, sharp)
     if config.sky_loss_mult > 0:
         losses["sky_loss"] = SkyLoss(config.sky_loss_mult)
     if config.surface_loss_mult > 0:
