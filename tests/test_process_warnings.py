@@ -178,6 +178,7 @@ def test_the_vehicle_is_found_in_few_pictures_with_lidars_help(mine: Path) -> No
     options = RigOptions(root=mine, output=mine.parent / "scene", cameras=("left", "right"), theta_max_deg=110.0)
     recording = read_rig_recording(options)
     _, notices = find_vehicle(recording, recording.pictures, options, Console(quiet=True))
+    assert [camera.name for camera in recording.cameras] == ["left", "right"]
     for camera in recording.cameras:
         true, kept = (read_mask(root / f"{camera.name}.png") for root in (mine / "masks", options.output / "ego_masks"))
         lens = lens_circle(camera.camera, 110.0)
