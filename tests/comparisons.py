@@ -31,7 +31,7 @@ def fake(scene, method, seed, psnr=20.0, steps=100, seconds=10.0, named=(), **mo
         for share in (0.5, 1.0)
     ]
     content = {
-        "run": {"scene": f"/scenes/{scene}", "method": method, "seed": seed, "implementation": "same"},
+        "run": {"scene": f"/scenes/{scene}", "method": method, "seed": seed},
         "named": list(named),
         "configuration": {"a": "1", "machine.seed": str(seed)},
         "lambda": None if method == "nerfacto" else 0.01,

@@ -14,7 +14,6 @@ from scenes import tree as contents
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_distance_png
-from edge_depth_nerf.process.command import process
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.scene.writer import ProcessReport
@@ -38,13 +37,13 @@ def drive(whole: RoomDrive, tmp_path: Path) -> RoomDrive:
     return replace(whole, root=tmp_path / "drive")
 
 
-def run(drive: RoomDrive, scene: str = "scene", all_steps: bool = False, **changes) -> tuple[ProcessReport, str]:
+def run(drive: RoomDrive, scene: str = "scene", **changes) -> tuple[ProcessReport, str]:
     folder = drive.root.parent
     options = {"root": drive.root, "sequence": SEQUENCE, "output": folder / scene, "mono": folder / "mono", "sweeps": 1}
-    options |= {"find_ego": False, "sky": False, "refine_poses": all_steps, **changes}
+    options |= {"find_ego": False, "sky": False, "refine_poses": False, **changes}
     console = Console(width=400, force_terminal=False)
     with console.capture() as said:
-        report = (process if all_steps else convert)(Kitti360Options(**options), console)
+        report = convert(Kitti360Options(**options), console)
     return report, said.get()
 
 
@@ -113,26 +112,22 @@ def test_a_mended_file_may_have_an_older_date(drive: RoomDrive) -> None:
     assert not run(drive)[0].left_out
 
 
-@pytest.mark.parametrize(
-    ("file", "change", "all_steps"), [(PICTURE, damage, False), (PICTURE, cut, False), (SWEEP, cut, False)]
-)
-def test_a_file_that_is_mended_comes_into_the_scene(
-    drive: RoomDrive, file: str, change: Change, all_steps: bool
-) -> None:
+@pytest.mark.parametrize(("file", "change"), [(PICTURE, damage), (PICTURE, cut), (SWEEP, cut)])
+def test_a_file_that_is_mended_comes_into_the_scene(drive: RoomDrive, file: str, change: Change) -> None:
     path = drive.root.parent / file
     whole = path.read_bytes()
     spoil(drive.root.parent, file, change)
-    assert run(drive, all_steps=all_steps)[0].left_out
+    assert run(drive)[0].left_out
     path.write_bytes(whole)
-    report, said = run(drive, all_steps=all_steps)
+    report, said = run(drive)
     assert report.written and not report.left_out and "Left out" not in said
     assert report.training + report.held_out == 24
-    run(drive, "other", all_steps=all_steps)
+    run(drive, "other")
     assert contents(report.scene) == contents(drive.root.parent / "other")
     # from here on it is whole, and another drive is another drive
     cut(path)
     with pytest.raises(InputError, match="contains another scene: inputs_sha256"):
-        run(drive, all_steps=all_steps)
+        run(drive)
 
 
 def test_a_camera_without_pictures_for_training(drive: RoomDrive) -> None:

@@ -204,8 +204,8 @@ def test_the_weight_of_the_depth_loss_falls_over_the_training():
         assert float(trained_step(model)[1]["edge_loss"]) == pytest.approx(expected * share, rel=1e-4)
 
 
-@pytest.mark.parametrize("sharp", [0.0, 0.02])
-def test_what_lidar_measured_keeps_its_weight(sharp):
+@pytest.mark.parametrize(("sharp", "scheduled"), [(0.0, False), (0.02, False), (0.02, True)])
+def test_what_lidar_measured_keeps_its_weight(sharp, scheduled):
     model = build(depth_loss_mult=0.5, depth_loss_final=0.01, depth_loss_sharp=sharp)
     model._training_steps = model._step = 100
     supervision = batch()
@@ -214,6 +214,10 @@ def test_what_lidar_measured_keeps_its_weight(sharp):
     supervision["prior_sigma_m"] = torch.where(measured, 0.019 * known + 0.02, 0.022 * known + 0.02)
     outputs, losses = trained_step(model, supervision)
     weights = torch.where(measured[:, 0] & (sharp > 0), 0.5, 0.005)
+    if scheduled:
+        # as in a recorded step, which reads λ from the device
+        model.scheduled_weight = torch.tensor(0.005)
+        losses = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
     levels = [replace(each, sigma_m=supervision["prior_sigma_m"][:, 0]) for each in levels_of(outputs)]
     expected = sum((weights * EdgeLoss()(each)).sum() for each in levels) / 12 / 3
     assert float(losses["edge_loss"]) == pytest.approx(float(expected), rel=1e-5)

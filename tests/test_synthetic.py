@@ -16,7 +16,7 @@ from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.synthetic import layout as layout_module
 from edge_depth_nerf.synthetic import lidar, rig
-from edge_depth_nerf.synthetic.drive import WORLD_ORIGIN_M, _manifest, synthesize_drive
+from edge_depth_nerf.synthetic.drive import WORLD_ORIGIN_M, _Kitti360, _manifest, synthesize_drive
 from edge_depth_nerf.synthetic.layout import simulated_estimate
 from edge_depth_nerf.synthetic.materials import Material, Noise
 from edge_depth_nerf.synthetic.motion import Drive, Route, Turn, WindingRoute
@@ -174,6 +174,13 @@ def test_sensors_stand_as_high_as_kitti360s():
 
 
 # ------------------------------------------------------------------------------------------------- determinism
+def test_each_pixel_of_small_pictures_has_its_rays(tmp_path):
+    """Beside what the lens cannot reach, too."""
+    drive = _Kitti360(SynthesizeOptions(tmp_path, "parking", frames=1, size=32))
+    drive.build()
+    assert all(np.isfinite(view._fine_rays).all() for view in drive.views.values()) and len(drive.views) == 2
+
+
 def test_same_options_same_bytes_and_interrupted_runs_are_continued(parking, tmp_path, monkeypatch):
     options, root = parking
     other = dataclasses.replace(options, output=tmp_path / "again")

@@ -265,7 +265,6 @@ def _record(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, 
         "kind": "comparison" if compared else "search",
         "preset": options.preset,
         "steps": options.steps,
-        "rivals_implementation": "same",
         "detail": compared is not None and compared.detail,
     }
     path = options.output / RECORD

@@ -36,8 +36,6 @@ class RunSpecification:
     """λ, where it is not the method's own."""
     sigma_m: Sigma | None = None
     """σ, metres, or own; None: the method's own."""
-    implementation: str = "same"
-    """Always this: all methods run in the same kernels."""
     whole_views: bool = True
     """Whether whole views are evaluated at the end, or only the random pixels."""
     detail: bool = False
