@@ -8,7 +8,7 @@ BIN := $(VENV)/$(SCRIPTS)
 .PHONY: help setup demo real gpu test test-fast test-pure coverage fuzz audit lint format docs dist check-dist version notes clean
 help:
 	@echo "make demo        synthesise a drive, train with and without the depth prior, compare (outputs/demo/)"
-	@echo "make real        all methods on a real drive, with three seeds (REAL=its folder; some hours)"
+	@echo "make real        all methods on real drives, with three seeds (REAL='their folders'; some hours)"
 	@echo "make gpu         what a GPU makes of it: start, steps, kernels, trainings, tests (outputs/gpu/report.md; eight minutes)"
 	@echo "make test-fast   tests of what needs no nerfstudio and a smoke run of the plugin, in a minute and a half"
 	@echo "make test        run all tests, in a quarter of an hour"
@@ -39,10 +39,10 @@ setup: $(VENV)/.installed
 demo: setup
 	$(BIN)/edge-depth-nerf demo --output outputs/demo
 
-# All methods on the real drive in a folder of yours (docs/results.md says which): make real REAL=FOLDER; some hours.
+# All methods on recordings of yours (docs/results.md says which): make real REAL="FOLDER FOLDER@2"; some hours. @2: half size.
 real: setup
-	@test -n "$(REAL)" || { echo "Give the folder with the real drive: make real REAL=FOLDER"; exit 2; }
-	$(BIN)/python -m benchmarks.quality.real_drive --real "$(REAL)" --output outputs/real_drive
+	@test -n "$(REAL)" || { echo "Give the folders of real drives: make real REAL='FOLDER FOLDER'"; exit 2; }
+	$(BIN)/python -m benchmarks.quality.real_drive $(REAL) --output outputs/real_drive
 
 # In parts that have limits; called again it does what is missing. GPU=--fake goes the same way without a GPU.
 gpu: setup

@@ -66,7 +66,8 @@ def take_picture(load_config: Path, output: Path) -> None:
             page.set_default_timeout(TIMEOUT_S * 1000)  # drawing by software keeps the page busy
             page.goto(f"http://127.0.0.1:{settings.websocket_port}")
             page.wait_for_selector("text=Output type")
-            page.get_by_label("LiDAR points").click()
+            for layer in ("LiDAR points", "Lenses"):
+                page.get_by_label(layer).click()
             page.mouse.move(10, 300)
             look_along_the_drive(viewer, dataset)
             deadline = time.monotonic() + TIMEOUT_S

@@ -168,9 +168,23 @@ def test_the_real_drives_table_by_hand(benchmark_module):
     assert real.best_rival(results, "kitti360_half") == ("ds-nerf", 120)
     assert real.best_rival(results, "another") is None
     longer = Results([run for run in results.runs if run.method == "ds-nerf"])
-    page = real.page(results, {"half": longer}).rstrip().splitlines()
+    page = real.page(results, {"kitti360_half": longer}).rstrip().splitlines()
     assert page[-2] == "| DS-NeRF loss, as many seconds as ours | 20.20 ± 0.28 | – | 0.250 | – | 100 |"
     assert page[-1].startswith("| ours |") and page[-1].endswith("| 120 |")
+    scanned = fake("kitti_0005_full", "edge", 0, scan_median_m=0.123, scan_within_30_cm=0.876, scan_abs_rel=0.05)
+    page = real.page(Results([*results.runs, scanned]), {}).rstrip().splitlines()
+    assert page[-5:-3] == ["## kitti_0005_full: held-out scans", ""]
+    assert page[-1] == "| ours | 12.3 | 87.6 | 0.050 | – | – | – |" and page[-3].count("|") == page[-1].count("|")
+
+
+def test_drives_are_named_by_folder_and_size(benchmark_module, tmp_path):
+    real = benchmark_module("quality.real_drive")
+    named = real.Drive.named("data/kitti360_drive@2"), real.Drive.named("kitti_0005"), real.Drive.named("a/b@3")
+    assert [each.name for each in named] == ["kitti360_half", "kitti_0005_full", "b_3"]
+    assert named[0].folder == Path("data/kitti360_drive") and [each.downscale for each in named] == [2, 1, 3]
+    methods = read_json(real.write_tuned(tmp_path / "tuned.json"))["methods"]
+    assert methods["ds-nerf-integrated-extras"] == methods["ds-nerf"] != methods["edge"] == methods["edge-plain"]
+    assert {*real.TABLE, *real.CELLS} - {"nerfacto"} <= methods.keys()
 
 
 def test_the_real_drives_picture_begins_with_what_was_recorded(benchmark_module, tmp_path):
@@ -197,7 +211,7 @@ def test_the_real_drives_picture_begins_with_what_was_recorded(benchmark_module,
 
 def test_the_real_drives_tables_are_those_of_its_runs(benchmark_module, kept, pages):
     compared, longer, full = (kept(f"real_drive{part}") for part in ("", "_seconds", "_full"))
-    made = benchmark_module("quality.real_drive").page(Results([*compared.runs, *full.runs]), {"half": longer})
+    made = benchmark_module("quality.real_drive").page(Results([*compared.runs, *full.runs]), {"kitti360_half": longer})
     assert_page_has(pages, "docs/results.md", {"real: table": "kitti360_half", "real: full": "kitti360_full"}, made)
 
 

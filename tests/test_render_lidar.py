@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,12 @@ from trainings import write_config
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.films import scan_command
-from edge_depth_nerf.films.placed import SceneToModel
 from edge_depth_nerf.films.scan_command import render_lidar
 from edge_depth_nerf.films.scan_options import RenderLidarOptions
-from edge_depth_nerf.films.scanning import Caster
 from edge_depth_nerf.lidar.patterns import ScanPattern
+from edge_depth_nerf.lidar.roughness import roughness
 from edge_depth_nerf.lidar.scans import PointTimes, ScanFormat, read_scan
+from edge_depth_nerf.plugin.scanning import FOLIAGE, Caster, SceneToModel, evaluate_scans
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.scene.reader import read_scene
@@ -190,8 +191,9 @@ def test_scans_along_the_recorded_path_are_those_that_were_recorded(drive, train
         assert distance.max() < LOST_M + 0.5
         assert len(points_m) == pytest.approx(len(measure(drive, frame)), rel=0.03)
     figures = read_json(output / "figures.json")
-    for name in ("sweeps", "beams"):
-        assert figures[name]["median_m"] < 2e-3 and figures[name]["within_10_cm"] == 1
+    assert figures.keys() == {"sweeps", "beams", "sweeps_in_pictures", "beams_in_pictures"}
+    assert all(found["median_m"] < 2e-3 and found["within_10_cm"] == 1 for found in figures.values())
+    assert 0 < figures["sweeps_in_pictures"]["rays"] < figures["sweeps"]["rays"]
     assert figures["sweeps"]["drop_f1"] > 0.9 and figures["sweeps"]["chamfer_m"] < 0.1
     lines = [line.split() for line in (output / "poses.txt").read_text().splitlines()[1:]]
     np.testing.assert_allclose(
@@ -205,6 +207,47 @@ def test_figures_say_how_far_a_model_is_off(trained, monkeypatch):
     found = read_json(output / "figures.json")["sweeps"]
     assert found["median_m"] == pytest.approx(0.2, abs=2e-3) and found["p95_m"] == pytest.approx(0.2, abs=2e-3)
     assert found["within_10_cm"] == 0 and found["within_30_cm"] == 1
+
+
+def test_a_training_is_held_against_what_a_camera_could_see_of_held_out_sweeps(scanner):
+    scene = read_scene(scanner.sweeps[0].path.parents[2])
+    outputs = SimpleNamespace(dataparser_transform=torch.eye(4)[:3], dataparser_scale=0.1)
+    dataset = SimpleNamespace(_dataparser_outputs=outputs)
+    model = RoomModel(SceneToModel.of(outputs, scene.meta), offset_m(scanner), off_m=0.9)
+    pipeline = SimpleNamespace(model=model, datamanager=SimpleNamespace(train_dataset=dataset))
+    figures, parts = evaluate_scans(pipeline, scene)
+    asked = []
+    for sweep in (each for each in scanner.sweeps if each.held_out):
+        rays, seen = sweep.read(), np.zeros(0)
+        for picture in (each for each in scene.pictures if each.frame == sweep.frame):
+            ahead = torch.from_numpy((rays.points_m - picture.position_m) @ picture.rotation * [1, -1, -1])
+            pixels, valid = picture.lens.project(ahead)
+            inside = ((pixels >= 0) & (pixels < 32)).all(1).numpy() & valid.numpy()
+            rows, columns = np.where(inside[:, None], pixels.numpy()[:, ::-1], 0).astype(int).T
+            seen = np.append(seen, np.flatnonzero(inside & scene.usable(picture)[rows, columns]))
+        asked.append(rays.distance_m[np.unique(seen).astype(int)])
+    lengths = np.concatenate(asked)
+    assert figures["scan_rays"] == len(lengths) == model.cast > 500
+    assert figures["scan_median_m"] == pytest.approx(0.9, abs=2e-3) and figures["scan_short_10"] == 0
+    assert figures["scan_far_25"] == (lengths < 0.9 / 0.25).mean() and figures["scan_far_10"] == (lengths < 9).mean()
+    assert figures["scan_abs_rel"] == pytest.approx((0.9 / lengths).mean(), abs=1e-3)
+    # each ray is in one part of each kind, and the nearest are the furthest off
+    by = {name: [part for part in parts if part["by"] == name] for name in ("distance_m", "elevation_deg", "roughness")}
+    assert [sum(part["rays"] for part in each) for each in by.values()] == [len(lengths)] * 3
+    assert by["distance_m"][0]["abs_rel"] > by["distance_m"][1]["abs_rel"] > 0.9 / 20
+
+
+def test_leaves_are_told_from_walls():
+    angle = np.linspace(-1.2, 1.2, 400)
+    wall_m = 4 / np.cos(angle)
+    leaves_m = wall_m * np.random.default_rng(0).uniform(0.8, 1, 400)
+    ring, offset_s = np.arange(3).repeat(400), np.tile(np.linspace(0, 0.1, 400), 3)
+    lengths, order = np.concatenate([wall_m, leaves_m, wall_m]), np.random.default_rng(1).permutation(1200)
+    found = roughness(lengths, ring, offset_s).reshape(3, 400)
+    assert (found[[0, 2]] < 1e-3).all() and (found[1] > FOLIAGE).mean() > 0.98
+    mixed = roughness(lengths[order], ring[order], offset_s[order])
+    np.testing.assert_array_equal(mixed, found.reshape(-1)[order])
+    assert np.isnan(roughness(wall_m, np.full(400, -1), offset_s[:400])).all()
 
 
 @pytest.mark.parametrize("form", ["ply", "pcd", "bin"])

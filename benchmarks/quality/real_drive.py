@@ -1,14 +1,15 @@
-"""A real drive as a benchmark: every method trained on it with several seeds.
+"""Real drives as a benchmark: every method trained on each with several seeds.
 
-    python -m benchmarks.quality.real_drive --real REAL --output outputs/real_drive
-    make real REAL=REAL
+    python -m benchmarks.quality.real_drive REAL/kitti360_drive@2 kitti_0005 --output outputs/real_drive
+    make real REAL="REAL/kitti360_drive@2 kitti_0005"
 
-REAL holds kitti360_drive, a recording that `process rig` reads (docs/results.md says which). It is processed at full
-and at half size: every sixth frame is held out with its LiDAR, and a tenth of the LiDAR's beams is held out of all
-sweeps. λ and σ are those that a search on a rendered drive found (tuned.json), for all methods alike; nothing is chosen
-on this drive. Then the rival with the best PSNR is trained once more, for as many steps as ours' processor seconds
-allow, its learning rates falling over these. Then, with the first seed, methods that differ from ours in prior, loss or
-extras alone. Writes table.md, table.json and views_SCENE.png. To resume a stopped run, start the same command again.
+Each argument is a recording that `process rig` reads (docs/results.md says which), @2: at half size. It is processed
+with every sixth frame held out with its LiDAR, and a tenth of the LiDAR's beams held out of all sweeps. λ and σ are
+those that a search on a rendered drive found (tuned.json), for all methods alike; nothing is chosen on these drives.
+Then the rival without our prior that has the best PSNR is trained once more on each drive, for as many steps as ours'
+processor seconds allow, its learning rates falling over these. Then, with the first seed and drive, methods that differ
+from ours in extras or prior alone. Writes table.md, table.json and views_SCENE.png. To resume a stopped run, start the
+same command again.
 """
 
 from __future__ import annotations
@@ -33,15 +34,14 @@ from edge_depth_nerf.compare.results import Results, RunResult, read_results
 from edge_depth_nerf.compare.specification import VIEWS
 from edge_depth_nerf.report.compared_views import compared_view, held_out_frames
 
-TABLE: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf", "edge-paper", "edge")
 RIVALS: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf")
-CELLS: dict[MethodName, MethodName] = {
-    "ds-nerf-integrated-extras": "ds-nerf",
-    "edge-plain": "edge",
-    "edge-lidar": "edge-lidar",
-}
-"""Methods that differ from ours in loss, extras or prior alone, and whose λ and σ each takes: those of its loss."""
-SIZES = {"half": 2, "full": 1}
+WITH_PRIOR: MethodName = "ds-nerf-integrated-extras"
+TABLE: tuple[MethodName, ...] = (*RIVALS, WITH_PRIOR, "edge-paper", "edge")
+CELLS: tuple[MethodName, ...] = ("edge-plain", "edge-lidar")
+"""Methods that differ from ours in extras or prior alone."""
+TUNED_AS: dict[MethodName, MethodName] = {WITH_PRIOR: "ds-nerf", "edge-plain": "edge"}
+"""Whose λ and σ a method takes that the search did not have: those of its loss."""
+SIZES = {1: "full", 2: "half"}
 HOLDOUT = ("--holdout-every", "6", "--holdout-beams", "10")
 SHOWN = 1
 """Number of the held-out picture that is drawn."""
@@ -54,6 +54,8 @@ class Column:
     title: str
     metric: str
     form: str
+    factor: float = 1
+    """From the figure's unit to the column's."""
 
 
 COLUMNS = (
@@ -62,12 +64,40 @@ COLUMNS = (
     Column("AbsRel", "lidar_abs_rel", ".3f"),
     Column("δ", "lidar_delta_1_25", ".3f"),
 )
+SCANS = (
+    Column("median, cm", "scan_median_m", ".1f", 100),
+    Column("within 30 cm, %", "scan_within_30_cm", ".1f", 100),
+    Column("AbsRel", "scan_abs_rel", ".3f"),
+    Column("25 % too far, %", "scan_far_25", ".1f", 100),
+    Column("foliage: AbsRel", "scan_foliage_abs_rel", ".3f"),
+    Column("foliage: 25 % too far, %", "scan_foliage_far_25", ".1f", 100),
+)
+"""Of the rays of held-out sweeps."""
 
 
-def write_tuned(path: Path, others: Mapping[MethodName, MethodName]) -> Path:
-    """Write λ and σ of methods: those that others were tuned to."""
+@dataclass(frozen=True)
+class Drive:
+    """A recording at a size."""
+
+    folder: Path
+    downscale: int
+
+    @classmethod
+    def named(cls, text: str) -> Drive:
+        """Read FOLDER or FOLDER@DOWNSCALE."""
+        folder, _, downscale = text.partition("@")
+        return cls(Path(folder), int(downscale or 1))
+
+    @property
+    def name(self) -> str:
+        """Of its scene: kitti360_half for kitti360_drive at half size."""
+        return f"{self.folder.name.removesuffix('_drive')}_{SIZES.get(self.downscale, self.downscale)}"
+
+
+def write_tuned(path: Path) -> Path:
+    """Write λ and σ of all methods."""
     methods = read_json(TUNED)["methods"]
-    write_json(path, {"methods": {name: methods[other] for name, other in others.items()}})
+    write_json(path, {"methods": methods | {name: methods[other] for name, other in TUNED_AS.items()}})
     return path
 
 
@@ -76,11 +106,11 @@ def values(runs: Sequence[RunResult], metric: str) -> list[float]:
     return [run.figures[metric] for run in runs if metric in run.figures]
 
 
-def row(title: str, found: Sequence[RunResult], *, timed: bool) -> str:
+def row(title: str, found: Sequence[RunResult], *, timed: bool, columns: Sequence[Column] = COLUMNS) -> str:
     """One method of a table, as Markdown: mean and standard deviation of its seeds."""
     cells = [title]
-    for column in COLUMNS:
-        each = values(found, column.metric)
+    for column in columns:
+        each = [column.factor * value for value in values(found, column.metric)]
         cells.append(with_spread(each, column.form) if each else "–")
     cells += [f"{statistics.mean(values(found, 'cpu_seconds')):.0f}"] if timed else []
     return "| " + " | ".join(cells) + " |"
@@ -102,6 +132,17 @@ def table(results: Results, scene: str, longer: Results | None = None) -> Iterat
             yield row(f"{METHODS[longer.runs[0].method].title}, as many seconds as ours", longer.runs, timed=True)
         if found := of(results, scene, method):
             yield row(METHODS[method].title, found, timed=longer is not None)
+
+
+def scans_table(results: Results, scene: str) -> Iterator[str]:
+    """All methods along the rays of a scene's held-out sweeps, as Markdown; nothing if no run was judged by them."""
+    if not any(values([run], SCANS[0].metric) for run in results.runs if run.scene == scene):
+        return
+    yield "| " + " | ".join(["method", *(column.title for column in SCANS)]) + " |"
+    yield "|---" * (len(SCANS) + 1) + "|"
+    for method in TABLE:
+        if found := of(results, scene, method):
+            yield row(METHODS[method].title, found, timed=False, columns=SCANS)
 
 
 def of(results: Results, scene: str, method: MethodName) -> list[RunResult]:
@@ -130,11 +171,13 @@ def page(results: Results, longer: Mapping[str, Results]) -> str:
 
     Args:
         results: of as many steps each.
-        longer: of the best rival in ours' seconds, by size.
+        longer: of the best rival in ours' seconds, by scene.
     """
-    parts = ["# A real drive, by all methods"]
+    parts = ["# Real drives, by all methods"]
     for scene in results.scenes():
-        parts += ["", f"## {scene}", "", *table(results, scene, longer.get(scene.removeprefix("kitti360_")))]
+        parts += ["", f"## {scene}", "", *table(results, scene, longer.get(scene))]
+        if scans := [*scans_table(results, scene)]:
+            parts += ["", f"## {scene}: held-out scans", "", *scans]
     return "\n".join([*parts, ""])
 
 
@@ -157,53 +200,52 @@ def draw_views(results: Results, scene: str, path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--real", type=Path, required=True, help="the folder that holds kitti360_drive")
+    parser.add_argument("drives", type=Drive.named, nargs="+", metavar="FOLDER[@DOWNSCALE]", help="recordings")
     parser.add_argument("--output", type=Path, default=Path("outputs/real_drive"))
-    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--steps", type=int, help="of each training; the preset's, if not set")
     parser.add_argument(
         "--equal-seconds",
-        nargs="*",
-        choices=SIZES,
-        default=["half"],
-        help="sizes: the best rival in ours' seconds",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="the best rival in ours' seconds",
     )
     parser.add_argument(
         "--cells", action=argparse.BooleanOptionalAction, default=True, help="methods that differ in one thing alone"
     )
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
     options = parser.parse_args()
-    drive = options.real / "kitti360_drive"
-    if not drive.is_dir():
-        sys.exit(
-            f"{drive}: no such folder; the real drive is not part of the project. docs/results.md says what it is."
-        )
+    for drive in options.drives:
+        if not drive.folder.is_dir():
+            sys.exit(
+                f"{drive.folder}: no such folder; real drives are not part of the project. docs/results.md says which."
+            )
+    tuned = write_tuned(options.output / "tuned.json")
+    common = ("--tuned", tuned, "--jobs", options.jobs)
     steps = ("--steps", options.steps) if options.steps else ()
-    jobs = ("--jobs", options.jobs)
-    compared = options.output / "compared"
-    scenes = {size: options.output / f"kitti360_{size}" for size in options.sizes}
-    for size, scene in scenes.items():
-        ours("process", "rig", "--root", drive, "--output", scene, "--downscale", SIZES[size], *HOLDOUT)
+    compared = {drive.name: options.output / "compared" / drive.name for drive in options.drives}
+    scenes = {drive.name: options.output / drive.name for drive in options.drives}
+    for drive in options.drives:
+        given = ("--root", drive.folder, "--output", scenes[drive.name], "--downscale", drive.downscale)
+        ours("process", "rig", *given, *HOLDOUT)
     for seed in options.seeds:
         # a seed is whole before the next begins: a stopped benchmark has a table of those it has
-        common = ("--methods", *TABLE, "--tuned", TUNED, "--output", compared, *jobs, *steps)
-        ours("compare", *scenes.values(), "--seeds", seed, *common)
-    results = read_results(compared / RUNS)
+        for name, scene in scenes.items():
+            given = ("--seeds", seed, "--methods", *TABLE, "--output", compared[name])
+            ours("compare", scene, *given, *common, *steps)
+    results = Results([run for path in compared.values() for run in read_results(path / RUNS).runs])
     longer: dict[str, Path] = {}
-    for size in options.equal_seconds:
-        if size in scenes and (best := best_rival(results, scenes[size].name)):
+    for name, scene in scenes.items():
+        if options.equal_seconds and (best := best_rival(results, name)):
             rival, length = best
-            common = ("--methods", rival, "--tuned", TUNED, "--steps", length, *jobs)
-            longer[size] = options.output / "equal_seconds" / f"{size}_{rival}_{length}"
-            ours("compare", scenes[size], "--seeds", *options.seeds, *common, "--output", longer[size])
-    evaluated = {size: read_results(path / RUNS) for size, path in longer.items()}
-    cells = options.output / "cells"
+            longer[name] = options.output / "equal_seconds" / f"{name}_{rival}_{length}"
+            given = ("--seeds", *options.seeds, "--methods", rival, "--output", longer[name])
+            ours("compare", scene, *given, *common, "--steps", length)
+    evaluated = {name: read_results(path / RUNS) for name, path in longer.items()}
     if options.cells:
-        scene = scenes.get("half", next(iter(scenes.values())))
-        given = write_tuned(options.output / "cells.json", CELLS)
-        common = ("--tuned", given, "--output", cells, *jobs, *steps)
-        ours("compare", scene, "--methods", *CELLS, "--seeds", options.seeds[0], *common)
+        first, output = next(iter(scenes.values())), options.output / "cells"
+        given = ("--seeds", options.seeds[0], "--methods", *CELLS, "--output", output)
+        ours("compare", first, *given, *common, *steps)
     write_text(options.output / "table.md", page(results, evaluated))
     for scene in results.scenes():
         draw_views(results, scene, options.output / f"views_{scene}.png")

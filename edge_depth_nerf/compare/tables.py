@@ -239,6 +239,26 @@ def _edges_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTab
     return made
 
 
+def _scans_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
+    """Rendered distances along the rays of held-out sweeps."""
+    metrics = [
+        Metric("scan_median_m", "median m ↓", ".3f", -1),
+        Metric("scan_within_10_cm", "within 10 cm ↑", ".1%"),
+        Metric("scan_within_30_cm", "within 30 cm ↑", ".1%"),
+        Metric("scan_abs_rel", "AbsRel ↓", ".3f", -1),
+        Metric("scan_far_25", "25 % too far ↓", ".1%", -1),
+        Metric("scan_short_25", "25 % too short ↓", ".1%", -1),
+        Metric("scan_foliage_abs_rel", "foliage: AbsRel ↓", ".3f", -1),
+        Metric("scan_foliage_far_25", "foliage: 25 % too far ↓", ".1%", -1),
+    ]
+    metrics = [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
+    note = (
+        "Errors of the rendered median distance along the scanner's own rays, 1-60 m, that end inside a held-out "
+        "picture. Foliage: rays whose neighbours' lengths scatter by 2 % or more; fences and outlines, too."
+    )
+    return _table(results, f"Held-out scans, {where}", scenes, list(map(_column, metrics)), note)
+
+
 def _time_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
     """Seconds, and the PSNR that they bring."""
     name, clock = curve_metric(results), clock_metric(results)
@@ -349,11 +369,13 @@ def make_tables(results: Results) -> list[MadeTable]:
             tables.append(made)
     # the average stands for its drives, which the page folds away
     *drives, first = means_over(everywhere)
-    has_edges = any(name.endswith("edge_recall") for run in results.runs for name in run.figures)
+    figures = {name for run in results.runs for name in run.figures}
+    wide = [_edges_table] * any(name.endswith("edge_recall") for name in figures)
+    wide += [_scans_table] * ("scan_median_m" in figures)
     for where, scenes in (first, *drives):
-        for make in (_geometry_table, _time_table, *([_edges_table] if has_edges else [])):
+        for make in (_geometry_table, _time_table, *wide):
             # of many columns a terminal shows nothing
-            fits = where == first[0] and make is not _edges_table
+            fits = where == first[0] and make not in wide
             tables.append(replace(make(results, where, scenes), on_terminal=fits))
     tables = sorted([*tables, _settings_table(results)], key=lambda made: not made.on_terminal)
     return [replace(made, label=str(number)) for number, made in enumerate(tables, 1)]

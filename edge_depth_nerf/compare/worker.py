@@ -40,8 +40,11 @@ from edge_depth_nerf.compare.specification import FIGURES, PROGRESS, SPECIFICATI
 from edge_depth_nerf.jobs.runs import end_with_parent, steps_done
 from edge_depth_nerf.jobs.tasks import WORK
 from edge_depth_nerf.mono.calibration import maps_trained_on
+from edge_depth_nerf.plugin.pipeline import evaluated
+from edge_depth_nerf.plugin.scanning import evaluate_scans
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 from edge_depth_nerf.scene.format import LAYERS, read_transforms
+from edge_depth_nerf.scene.reader import read_scene
 
 CURVE = (0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """When the random pixels are evaluated, as shares of the training."""
@@ -223,6 +226,9 @@ def do_run(folder: Path) -> None:
         evaluator = ViewEvaluator(trainer.pipeline, on_view)
         found, bins = evaluator.held_out(folder / VIEWS)
         figures |= found | evaluator.shifted(beside) | evaluate_beams(trainer.pipeline)
+        with evaluated(trainer.pipeline.model):
+            of_scans, bins["scan_parts"] = evaluate_scans(trainer.pipeline, read_scene(Path(run.scene)))
+        figures |= of_scans
         if run.detail:
             figures |= evaluator.with_detail(folder / VIEWS, beside)
     weight, sigma = setting_of(config, run.method)

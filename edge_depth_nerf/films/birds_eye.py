@@ -24,10 +24,11 @@ from edge_depth_nerf.films.birds_eye_options import RANGES, BirdsEyeOptions
 from edge_depth_nerf.films.ground_plan import TILE_PX, GroundPlan, Tile, driven_path
 from edge_depth_nerf.films.paths import up_of
 from edge_depth_nerf.films.placed import placed
-from edge_depth_nerf.films.scanning import HIT, Caster, load_model
+from edge_depth_nerf.films.scanning import HIT, load_model
 from edge_depth_nerf.films.seen import TrainingViews
 from edge_depth_nerf.jobs.runs import steps_done
 from edge_depth_nerf.plugin.compat import quiet_host
+from edge_depth_nerf.plugin.scanning import Caster
 from edge_depth_nerf.scene.reader import SceneFolder
 
 PICTURE, HEIGHT, RECORD, TILES = "road.png", "height.tif", "birds_eye.json", "tiles"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json_object
 from edge_depth_nerf.cameras.transforms import rigid
 from edge_depth_nerf.films.training import read_dataparser
+from edge_depth_nerf.plugin.scanning import SceneToModel
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
 SAVED_TRANSFORM = "dataparser_transforms.json"
@@ -23,23 +23,6 @@ OUTSIDE_M = 10.0
 """A message warns of a path that is further from the drive than this."""
 SAME_PLACE = 1e-3
 """Largest difference of a camera's position between the path and the training, in scene units."""
-
-
-@dataclass(frozen=True)
-class SceneToModel:
-    """Transform from a scene to the coordinates that its model was trained in."""
-
-    rotation: Float64[np.ndarray, "3 3"]
-    shift_m: Float64[np.ndarray, "3"]
-    """Added after the rotation and before the scaling."""
-    units_per_metre: float
-
-    def poses(self, camera_to_scene: Float64[np.ndarray, "n 4 4"]) -> Float64[np.ndarray, "n 4 4"]:
-        """Turn poses in the scene (metres) into poses in the model's coordinates."""
-        moved = camera_to_scene.copy()
-        moved[:, :3, :3] = self.rotation @ camera_to_scene[:, :3, :3]
-        moved[:, :3, 3] = self.units_per_metre * (camera_to_scene[:, :3, 3] @ self.rotation.T + self.shift_m)
-        return moved
 
 
 def poses_of(pictures: Sequence[ScenePicture]) -> Float64[np.ndarray, "n 4 4"]:
@@ -77,11 +60,7 @@ def placed(load_config: Path, moved_to: Path | None) -> tuple[SceneFolder, Scene
     dataparser.data = scene.path
     outputs = dataparser.setup().get_dataparser_outputs(split="train")
     _check_unchanged(outputs, load_config.parent / SAVED_TRANSFORM, scene)
-    # both start from the coordinates before transforms.json, which nerfstudio may have changed
-    applied = np.vstack((scene.meta.get("applied_transform", np.eye(4)[:3]), [0, 0, 0, 1])).astype(np.float64)
-    transform = outputs.dataparser_transform.numpy().astype(np.float64) @ np.linalg.inv(applied)
-    scale = float(outputs.dataparser_scale) / float(scene.meta.get("applied_scale", 1.0))
-    to_model = SceneToModel(transform[:, :3], transform[:, 3], scale)
+    to_model = SceneToModel.of(outputs, scene.meta)
 
     trained = outputs.cameras.camera_to_worlds.numpy()[:, :3, 3].astype(np.float64)
     ours = to_model.poses(poses_of(scene.pictures))[:, :3, 3]

@@ -1,46 +1,28 @@
-"""A trained model as a scanner sees it: how far rays go, which of them come back, and how true that is. Host-facing."""
+"""Scans of a trained model: which rays come back, and how true the scans are. Host-facing."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Float32
-from nerfstudio.cameras.rays import RayBundle
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.numbers import spread_over
-from edge_depth_nerf.films.placed import SceneToModel
 from edge_depth_nerf.lidar.patterns import ScanPattern, pattern_of_scan
 from edge_depth_nerf.lidar.sweeps import MIN_RANGE_M
 from edge_depth_nerf.lidar.trajectory import Trajectory
+from edge_depth_nerf.plugin.scanning import MOST_RAYS, Cast, Caster, errors, held_out_sweeps, in_pictures, some_of
+from edge_depth_nerf.scene.reader import SceneFolder
 from edge_depth_nerf.scene.sweeps import SceneScanner, SceneSweep, SweepRays
 
 HIT = 0.5
 """A ray that stops less than this share of its light hits nothing."""
-MOST_LEARNED_SWEEPS, MOST_EVALUATED_SWEEPS = 4, 10
-MOST_RAYS = 30_000
-"""Of a sweep, for learning which rays come back and for figures."""
-_PIXEL_AREA = 1e-6
-"""Of a beam at distance 1; nerfacto does not use it."""
-
-
-@dataclass(frozen=True, eq=False)
-class Cast:
-    """What rays meet."""
-
-    distance_m: Float32[np.ndarray, "*rays"]
-    """Where half of the light that is stopped is stopped."""
-    hit: Float32[np.ndarray, "*rays"]
-    """The share of the light that is stopped, 0 to 1."""
-    rgb: Float32[np.ndarray, "*rays 3"] | None = None
-    """Colours, 0 to 1, where the model renders any."""
+MOST_LEARNED_SWEEPS = 4
+"""For learning which rays come back, `MOST_RAYS` of all together."""
 
 
 def load_model(load_config: Path, scene: Path) -> Any:
@@ -56,53 +38,17 @@ def load_model(load_config: Path, scene: Path) -> Any:
     return pipeline.model
 
 
-class Caster:
-    """Casts rays into a trained model."""
+def scan(caster: Caster, pattern: ScanPattern, time_s: float, scanner: Trajectory) -> tuple[Cast, NDArray, NDArray]:
+    """Cast all rays of a turn at `time_s` while the scanner moves.
 
-    def __init__(self, model: Any, to_model: SceneToModel) -> None:
-        """Take nerfstudio's model, ours or nerfacto, and the scene's place in it."""
-        self._model, self._to_model = model, to_model
-
-    @torch.no_grad()
-    def cast(
-        self,
-        origin_m: Float[np.ndarray, "*rays 3"],
-        direction: Float[np.ndarray, "*rays 3"],
-        reach_m: float | None = None,
-    ) -> Cast:
-        """Cast rays from places in the scene (metres) along unit vectors in the scene.
-
-        They begin at the model's near plane and end at its far plane; with `reach_m` they begin at their origins, end
-        after so many metres, and meet no sky.
-        """
-        shape = direction.shape[:-1]
-        flat = [each.reshape(1, -1, 3) for each in (origin_m, direction)]
-        place = self._to_model
-        origins = place.units_per_metre * (flat[0] @ place.rotation.T + place.shift_m)
-        given = (torch.from_numpy(each.astype(np.float32)) for each in (origins, flat[1] @ place.rotation.T))
-        origins_, directions = (each.to(self._model.device) for each in given)
-        one = origins_.new_ones(*origins_.shape[:-1], 1)
-        rays = RayBundle(origins_, directions, _PIXEL_AREA * one, torch.zeros_like(one, dtype=torch.long))
-        rays.metadata = {"directions_norm": one}
-        if reach_m is not None:
-            rays.nears, rays.fars = torch.zeros_like(one), one * reach_m * place.units_per_metre
-        outputs = self._model.get_outputs_for_camera_ray_bundle(rays)
-        found = (outputs[name].reshape(shape).float().cpu().numpy() for name in ("depth", "accumulation"))
-        depth, hit = found
-        rgb = outputs["rgb"].reshape(*shape, 3).float().cpu().numpy() if "rgb" in outputs else None
-        return Cast(depth / np.float32(place.units_per_metre), hit, rgb)
-
-    def scan(self, pattern: ScanPattern, time_s: float, scanner: Trajectory) -> tuple[Cast, NDArray, NDArray]:
-        """Cast all rays of a turn at `time_s` while the scanner moves.
-
-        Returns:
-            What they meet, [rings, firings]; and their origins [firings, 3] and directions [rings, firings, 3] in the
-            scene.
-        """
-        poses = scanner.at(time_s + pattern.offset_s)
-        directions = np.einsum("fij,rfj->rfi", poses[:, :3, :3], pattern.directions)
-        origins = poses[:, :3, 3]
-        return self.cast(np.broadcast_to(origins, directions.shape), directions), origins, directions
+    Returns:
+        What they meet, [rings, firings]; and their origins [firings, 3] and directions [rings, firings, 3] in the
+        scene.
+    """
+    poses = scanner.at(time_s + pattern.offset_s)
+    directions = np.einsum("fij,rfj->rfi", poses[:, :3, :3], pattern.directions)
+    origins = poses[:, :3, 3]
+    return caster.cast(np.broadcast_to(origins, directions.shape), directions), origins, directions
 
 
 def in_scanner(sweep: SceneSweep, rays: SweepRays, scanner: Trajectory) -> Float[np.ndarray, "rays 3"]:
@@ -178,7 +124,7 @@ def learn_ray_drop(caster: Caster, scanner: SceneScanner, pattern: ScanPattern) 
     """Learn from a drive's own sweeps which rays come back; only from those that the training saw."""
     training = [sweep for sweep in scanner.sweeps if not sweep.held_out]
     rng, casts, back = np.random.default_rng(0), [], []
-    for sweep in _spread(training, MOST_LEARNED_SWEEPS):
+    for sweep in (training[place] for place in spread_over(len(training), MOST_LEARNED_SWEEPS)):
         whole = came_back(sweep, sweep.read(), pattern, scanner.trajectory)
         rows, columns = (rng.integers(count, size=MOST_RAYS // MOST_LEARNED_SWEEPS) for count in whole.shape)
         poses = scanner.trajectory.at(sweep.time_s + pattern.offset_s)[columns]
@@ -191,23 +137,6 @@ def learn_ray_drop(caster: Caster, scanner: SceneScanner, pattern: ScanPattern) 
     return RayDrop.learned(together, np.concatenate(back))
 
 
-def _spread(sweeps: Sequence[SceneSweep], most: int) -> list[SceneSweep]:
-    return [sweeps[place] for place in spread_over(len(sweeps), most)]
-
-
-def errors(measured_m: Float[np.ndarray, "rays"], rendered_m: Float[np.ndarray, "rays"]) -> dict[str, float]:
-    """Give figures of rendered distances along rays whose length a scanner measured."""
-    error_m = np.abs(rendered_m.astype(np.float64) - measured_m)
-    return {
-        "rays": float(len(error_m)),
-        "median_m": float(np.median(error_m)),
-        "p95_m": float(np.quantile(error_m, 0.95)),
-        "within_10_cm": float((error_m <= 0.1).mean()),
-        "within_30_cm": float((error_m <= 0.3).mean()),
-        "abs_rel": float((error_m / measured_m).mean()),
-    }
-
-
 def chamfer_m(points_m: Float[np.ndarray, "points 3"], others_m: Float[np.ndarray, "others 3"]) -> float:
     """Give the mean distance from a point of one scan to the nearest of the other, mean of both ways, metres."""
     ways = (KDTree(others_m).query(points_m)[0], KDTree(points_m).query(others_m)[0])
@@ -215,38 +144,31 @@ def chamfer_m(points_m: Float[np.ndarray, "points 3"], others_m: Float[np.ndarra
 
 
 def evaluate(
-    caster: Caster, scanner: SceneScanner, pattern: ScanPattern | None, ray_drop: RayDrop
+    caster: Caster, scene: SceneFolder, scanner: SceneScanner, pattern: ScanPattern | None, ray_drop: RayDrop
 ) -> dict[str, dict[str, float]]:
     """Hold the model against what no training saw: held-out sweeps, and held-out beams of the others.
 
     Along each recorded ray, of at most `MOST_RAYS` a sweep, the rendered distance is compared with the measured one.
 
     Returns:
-        Figures of `sweeps` and `beams`, where there are any. With a pattern those of sweeps have also `drop_f1` (of
-        rays that did not come back) and `chamfer_m` between the whole rendered scan and the recorded one.
+        Figures of `sweeps` and `beams`, where there are any, and the same of `…_in_pictures`, the rays that end inside
+        a picture of their frame. With a pattern those of sweeps have also `drop_f1` (of rays that did not come back)
+        and `chamfer_m` between the whole rendered scan and the recorded one.
     """
-    found: dict[str, dict[str, float]] = {}
-    chosen = {
-        "sweeps": [sweep for sweep in scanner.sweeps if sweep.held_out],
-        "beams": [sweep for sweep in scanner.sweeps if not sweep.held_out],
-    }
-    for name, sweeps in chosen.items():
-        measured, rendered, more = [], [], []
-        for sweep in _spread(sweeps, MOST_EVALUATED_SWEEPS):
-            rays = sweep.read()
-            of_use = np.flatnonzero(rays.held_out if name == "beams" else np.ones(len(rays.ring), bool))
-            if len(of_use) > MOST_RAYS:
-                of_use = np.random.default_rng(0).choice(of_use, MOST_RAYS, replace=False)
-            if not len(of_use):
-                continue
-            cast = caster.cast(rays.origin_m[of_use].astype(np.float64), rays.direction[of_use].astype(np.float64))
-            measured.append(rays.distance_m[of_use])
-            rendered.append(cast.distance_m)
-            if pattern is not None and name == "sweeps":
-                more.append(_of_whole(caster, scanner.trajectory, sweep, rays, pattern, ray_drop))
-        if measured:
-            found[name] = errors(np.concatenate(measured), np.concatenate(rendered))
-            found[name] |= {key: float(np.mean([each[key] for each in more])) for key in (more[0] if more else ())}
+    lengths: dict[str, list[tuple[NDArray, NDArray]]] = {}
+    more: list[dict[str, float]] = []
+    for kind, sweep, rays, counts in held_out_sweeps(scanner):
+        chosen = some_of(counts)
+        both = rays.distance_m[chosen], caster.cast_at(rays, chosen)
+        shown = in_pictures(scene, sweep, rays)[chosen]
+        for name, part in ((kind, slice(None)), (f"{kind}_in_pictures", shown)):
+            lengths.setdefault(name, []).append((both[0][part], both[1][part]))
+        if pattern is not None and kind == "sweeps":
+            more.append(_of_whole(caster, scanner.trajectory, sweep, rays, pattern, ray_drop))
+    together = {name: tuple(map(np.concatenate, zip(*each, strict=True))) for name, each in lengths.items()}
+    found = {name: errors(*both) for name, both in together.items() if len(both[0])}
+    if more:
+        found["sweeps"] |= {key: float(np.mean([each[key] for each in more])) for key in more[0]}
     return found
 
 
@@ -258,7 +180,7 @@ def _of_whole(
     pattern: ScanPattern,
     ray_drop: RayDrop,
 ) -> dict[str, float]:
-    cast, origins, directions = caster.scan(pattern, sweep.time_s, scanner)
+    cast, origins, directions = scan(caster, pattern, sweep.time_s, scanner)
     kept = ray_drop.kept(cast, pattern.reach_m)
     lost, truly = ~kept, ~came_back(sweep, rays, pattern, scanner)
     both = (lost & truly).sum()

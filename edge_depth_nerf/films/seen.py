@@ -5,11 +5,10 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float64
 
 from edge_depth_nerf.base.numbers import spread_over
-from edge_depth_nerf.films.scanning import Caster
+from edge_depth_nerf.plugin.scanning import Caster, points_within
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 REACH_M = 25.0
@@ -83,13 +82,8 @@ class TrainingViews:
     def _distance_m(self, number: int, points_m: Float64[np.ndarray, "points 3"]) -> Float64[np.ndarray, "points"]:
         """Distances from a picture's camera to those points that lie inside its mask; infinite for the others."""
         picture: ScenePicture = self._pictures[number]
-        ahead = points_m - picture.position_m
-        in_camera = torch.from_numpy(ahead @ picture.rotation * np.array([1.0, -1.0, -1.0]))
-        pixels, valid = picture.lens.project(in_camera)
-        inside = np.flatnonzero((valid & picture.lens.inside(pixels)).numpy())
-        column, row = pixels.numpy()[inside].astype(int).T
         found = np.full(len(points_m), np.inf)
-        used = inside[self._usable(number)[row, column]]
-        away_m = np.linalg.norm(ahead[used], axis=1)
+        used = points_within(picture, self._usable(number), points_m)
+        away_m = np.linalg.norm(points_m[used] - picture.position_m, axis=1)
         found[used] = np.where(away_m <= REACH_M, away_m, np.inf)
         return found
