@@ -12,6 +12,7 @@ from scenes import write_scene
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import write_json
 from edge_depth_nerf.compare import tables
+from edge_depth_nerf.compare.plots import draw_plots
 from edge_depth_nerf.compare.report import _of_drive
 from edge_depth_nerf.compare.results import Results, RunResult, check_fair
 from edge_depth_nerf.report.tables import latex_of_tables, page_of_tables, show_tables
@@ -34,6 +35,32 @@ def results():
         for seed, psnr in enumerate(figures)
     ]
     return Results(runs, {"preset": "lite", "tuned": {}}, {"nerfstudio": "1.1.5"}, 2)
+
+
+def test_held_out_scans_have_a_table_and_a_plot(tmp_path):
+    runs = [
+        fake("street", "nerfacto", 0, scan_median_m=0.5, scan_within_30_cm=0.25, scan_foliage_far_25=0.125),
+        fake("street", "edge", 0, scan_median_m=0.1, scan_within_30_cm=0.875, scan_foliage_far_25=0.25),
+        fake("street", "ds-nerf", 0),
+    ]
+    results = Results(runs, {"preset": "lite", "tuned": {}}, {}, 2)
+    made = table(results, "Held-out scans, street")
+    assert made.groups[0][1] == ["median m ↓", "within 30 cm ↑", "foliage: 25 % too far ↓"] and not made.on_terminal
+    assert [[cell.text() for cell in row.cells] for row in made.rows] == [
+        ["0.500", "25.0%", "12.5%"],
+        ["–", "–", "–"],
+        ["0.100", "87.5%", "25.0%"],
+    ]
+    assert not any(plot.title.startswith("Errors of held-out scans") for plot in draw_plots(tmp_path, results))
+    for run, share in zip(runs, (0.2, 0.8), strict=False):
+        run.content["scan_within"] = [{"error_m": 0.1, "share": share / 2}, {"error_m": 1.0, "share": share}]
+    plots = [plot for plot in draw_plots(tmp_path, results) if plot.title == "Errors of held-out scans"]
+    assert len(plots) == 1 and (tmp_path / "error_of_scans.svg").read_bytes() == plots[0].light
+    for colour in ("#888888", "#d62828"):
+        assert f"stroke: {colour}".encode() in plots[0].light
+    assert not [
+        made for made in tables.make_tables(Results([runs[2]], results.options, {}, 2)) if "scans" in made.title
+    ]
 
 
 TO_CLEAN = "PSNR to clean ↑"

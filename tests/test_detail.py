@@ -14,8 +14,8 @@ from edge_depth_nerf.compare.evaluation import ViewEvaluator, shifted_views
 from edge_depth_nerf.method.detail import carried, detail_of, pictures_that_see, seen_from
 from edge_depth_nerf.plugin import detail as plugin_detail
 from edge_depth_nerf.plugin.detail import TrainingDetail, detail_shown, with_appearance_of
+from edge_depth_nerf.plugin.evaluation import evaluated
 from edge_depth_nerf.plugin.exposure import Gains
-from edge_depth_nerf.plugin.pipeline import evaluated
 
 GREY = 0.5
 LENSES = {"fisheye": [fisheye(64, 56)], "pinhole": [pinhole(64, 56)], "both": [fisheye(64, 56), pinhole(64, 56)]}

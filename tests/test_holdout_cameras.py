@@ -20,7 +20,7 @@ from edge_depth_nerf.method.edges import picture_edges_found
 from edge_depth_nerf.method.metrics import masked_psnr
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, check_split
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
-from edge_depth_nerf.plugin.pipeline import evaluated
+from edge_depth_nerf.plugin.evaluation import evaluated
 from edge_depth_nerf.process import motion
 from edge_depth_nerf.process.colmap import refine as refining
 from edge_depth_nerf.process.converters import convert, read_drive

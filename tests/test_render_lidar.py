@@ -1,31 +1,38 @@
 """The scanners' own rays in a scene, and scans rendered of it: a room whose every distance is known in closed form."""
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 from drives import SEQUENCE, RoomDrive, cut, pose, wall_distance, write_points, write_room_drive
+from PIL import Image
 from rich.console import Console
 from trainings import write_config
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
+from edge_depth_nerf.base.pictures import NO_VALUE_RGB
 from edge_depth_nerf.films import scan_command
+from edge_depth_nerf.films.intensities import Intensities
 from edge_depth_nerf.films.scan_command import render_lidar
+from edge_depth_nerf.films.scan_film import SIZE_PX, draw_scan
 from edge_depth_nerf.films.scan_options import RenderLidarOptions
 from edge_depth_nerf.lidar.patterns import ScanPattern
 from edge_depth_nerf.lidar.roughness import roughness
 from edge_depth_nerf.lidar.scans import PointTimes, ScanFormat, read_scan
+from edge_depth_nerf.plugin import viewer
 from edge_depth_nerf.plugin.scanning import FOLIAGE, Caster, SceneToModel, evaluate_scans
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.scene.reader import read_scene
-from edge_depth_nerf.scene.sweeps import SceneScanner, scanners_of
+from edge_depth_nerf.scene.sweeps import SceneScanner, SceneSweep, SweepRays, scanners_of
 
 QUIET = Console(quiet=True)
 PATTERN = ScanPattern("test", np.radians(np.linspace(15.0, -25.0, 12)), 240, 100.0)
@@ -215,7 +222,8 @@ def test_a_training_is_held_against_what_a_camera_could_see_of_held_out_sweeps(s
     dataset = SimpleNamespace(_dataparser_outputs=outputs)
     model = RoomModel(SceneToModel.of(outputs, scene.meta), offset_m(scanner), off_m=0.9)
     pipeline = SimpleNamespace(model=model, datamanager=SimpleNamespace(train_dataset=dataset))
-    figures, parts = evaluate_scans(pipeline, scene)
+    figures, kept = evaluate_scans(pipeline, scene)
+    parts, within = kept["scan_parts"], kept["scan_within"]
     asked = []
     for sweep in (each for each in scanner.sweeps if each.held_out):
         rays, seen = sweep.read(), np.zeros(0)
@@ -231,10 +239,29 @@ def test_a_training_is_held_against_what_a_camera_could_see_of_held_out_sweeps(s
     assert figures["scan_median_m"] == pytest.approx(0.9, abs=2e-3) and figures["scan_short_10"] == 0
     assert figures["scan_far_25"] == (lengths < 0.9 / 0.25).mean() and figures["scan_far_10"] == (lengths < 9).mean()
     assert figures["scan_abs_rel"] == pytest.approx((0.9 / lengths).mean(), abs=1e-3)
+    assert [entry["share"] for entry in within] == [float(entry["error_m"] > 0.9) for entry in within]
     # each ray is in one part of each kind, and the nearest are the furthest off
     by = {name: [part for part in parts if part["by"] == name] for name in ("distance_m", "elevation_deg", "roughness")}
     assert [sum(part["rays"] for part in each) for each in by.values()] == [len(lengths)] * 3
     assert by["distance_m"][0]["abs_rel"] > by["distance_m"][1]["abs_rel"] > 0.9 / 20
+
+
+def test_the_viewer_shows_a_held_out_sweep_as_the_model_renders_it(scanner, monkeypatch):
+    scene = read_scene(scanner.sweeps[0].path.parents[2])
+    outputs = SimpleNamespace(dataparser_transform=torch.eye(4)[:3], dataparser_scale=0.1)
+    place = SceneToModel.of(outputs, scene.meta)
+    dataset = SimpleNamespace(_dataparser_outputs=outputs, scene=scene)
+    pipeline = SimpleNamespace(model=RoomModel(place, offset_m(scanner), off_m=0.3))
+    layers = SimpleNamespace(
+        manager=SimpleNamespace(train_dataset=dataset), viewer=SimpleNamespace(pipeline=pipeline, train_lock=None)
+    )
+    monkeypatch.setattr(viewer, "evaluated", lambda _: nullcontext())
+    cloud = viewer.DriveLayers._scan(cast(viewer.DriveLayers, layers))
+    held_out = [sweep for sweep in scanner.sweeps if sweep.held_out]
+    rays = held_out[len(held_out) // 2].read()
+    expected = place.points(rays.origin_m + rays.direction * (rays.distance_m[:, None] + 0.3))
+    np.testing.assert_allclose(cloud.points, expected, atol=1e-3)
+    np.testing.assert_allclose(np.asarray(cloud.sigma_m), 0.3, atol=5e-3)
 
 
 def test_leaves_are_told_from_walls():
@@ -262,6 +289,88 @@ def test_files_hold_places_times_and_rings(trained, form):
         ring = read_scan(path, ScanFormat(times=PointTimes("ring"))).offset_s
         assert ring is not None and scan.offset_s is not None
         np.testing.assert_allclose(15 - 2 * ring.numpy(), elevation, atol=1e-3)
+
+
+def stripes(points_m: np.ndarray) -> np.ndarray:
+    """Intensities of 10 and 40 in stripes of two metres along the scene's x."""
+    return np.where(points_m[:, 0] % 4 < 2, 10.0, 40.0)
+
+
+def test_scans_are_as_bright_as_training_sweeps_found_their_places(scanner, trained, monkeypatch):
+    def bright(sweep: SceneSweep, read: Any = SceneSweep.read) -> SweepRays:
+        rays = read(sweep)
+        return replace(rays, intensity=stripes(rays.points_m).astype(np.float32))
+
+    asked = []
+
+    def listed(sweep: SceneSweep) -> Any:
+        asked.append(sweep)
+        return bright(sweep)
+
+    sweeps = [SimpleNamespace(held_out=each.held_out, read=partial(listed, each)) for each in scanner.sweeps]
+    found = Intensities.learned(cast(SceneScanner, SimpleNamespace(sweeps=sweeps)))
+    assert found is not None and asked and not any(sweep.held_out for sweep in asked)
+    assert Intensities.learned(scanner) is None  # all are 0.5
+    monkeypatch.setattr(scan_command.Intensities, "learned", lambda _: found)
+    monkeypatch.setattr(SceneSweep, "read", bright)
+    first = scanner.sweeps[0].scanner_to_scene
+    for form in ("ply", "pcd", "bin"):
+        output = render_lidar(RenderLidarOptions(trained, form=form, every=9, output=trained.parent / form), QUIET)
+        path = output / f"{0:010d}.{form}"
+        if form == "bin":
+            got = np.fromfile(path, "<f4").reshape(-1, 4)[:, 3]
+        else:
+            got = np.asarray(read_scan(path, ScanFormat(times=PointTimes("intensity"))).offset_s)
+        points_m = read_scan(path, ScanFormat()).points_m.numpy()
+        # nearly where the scan stands in the scene: the vehicle moves a decimetre
+        expected = stripes(points_m @ first[:3, :3].T + first[:3, 3])
+        assert (np.abs(got - expected) < 8).mean() > 0.85 and np.std(expected) > 10
+    error = read_json(trained.parent / "ply/figures.json")["sweeps_in_pictures"]["intensity_error"]
+    assert 0 < error < 0.2
+
+
+def test_each_beam_is_as_bright_as_it_measures_at_its_range():
+    """Two beams with other gains, and half of everything beyond 8 m, at a wall of two materials."""
+    rng = np.random.default_rng(0)
+    points_m = rng.uniform((2, -1, 0), (30, 1, 3), (40_000, 3))
+    ring, distance_m = rng.integers(2, size=40_000), np.linalg.norm(points_m, axis=1)
+
+    def measured(points_m: np.ndarray, ring: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
+        return (
+            np.where(points_m[:, 1] > 0, 10.0, 30.0) * np.where(ring == 0, 1.0, 3.0) * np.where(distance_m > 8, 0.5, 1)
+        )
+
+    found = Intensities(points_m, measured(points_m, ring, distance_m), ring, distance_m)
+    there = points_m[np.abs(points_m[:, 1]) > 0.3][:1000] + 0.02
+    away_m = np.linalg.norm(there, axis=1)
+    for one in (0, 1):
+        of = np.full(1000, one)
+        off = found.at(there, of, away_m) / measured(there, of, away_m) - 1
+        assert np.median(np.abs(off)) < 0.02 and np.quantile(np.abs(off), 0.95) < 0.1
+    # another scanner's: between the two
+    between = found.at(there, np.full(1000, -1), away_m) / measured(there, np.zeros(1000), away_m)
+    assert 0.8 < between.min() and between.max() < 3 and 1.3 < between.mean() < 2.2
+
+
+def test_a_film_shows_each_scan(trained):
+    output = render_lidar(RenderLidarOptions(trained, film=True, every=2), QUIET)
+    with Image.open(output / "scans.webp") as film:
+        assert (film.n_frames, film.size) == (5, SIZE_PX)
+        film.seek(3)
+        shown = np.asarray(film.convert("RGB"))
+    drawn = draw_scan(read_scan(output / f"{6:010d}.ply", ScanFormat()).points_m.numpy())
+    seen, expected = ((np.abs(each.astype(int) - NO_VALUE_RGB) > 25).any(2) for each in (shown, drawn))
+    assert (seen & expected).sum() > 0.7 * expected.sum() > 0.7 * 1000
+    assert (seen & expected[:, ::-1]).sum() < 0.4 * expected.sum()
+
+
+def test_points_are_drawn_from_behind_and_above():
+    ahead = np.array([[20.0, 0.0, -1.0], [20.0, 5.0, -1.0], [60.0, 0.0, -1.0], [-15.0, 0.0, 0.0]])
+    rows, columns = np.nonzero((draw_scan(ahead) != NO_VALUE_RGB).any(2))
+    middle, left = SIZE_PX[0] // 2, columns.min()
+    # what is farther is higher, what is behind the camera is not drawn
+    assert len(rows) == 3 * 4 and left < middle and (columns == middle).sum() == 2 * 2
+    assert rows[columns == middle].min() < rows[columns == left].min() == rows[columns == middle].max() - 1
 
 
 def test_a_lane_shift_is_as_far_as_it_was_asked_for(drive, trained):

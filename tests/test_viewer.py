@@ -214,12 +214,12 @@ def test_what_is_not_there_cannot_be_switched_on(tmp_path):
     pipeline = pipeline_of(write_scene(tmp_path, lidar=False, mono=False), "test", depth_loss="none")
     switches = pipeline.drive.layers.switches
     assert {name: switch.disabled for name, switch in switches.items()} == {
-        **{"lenses": False, "path": False, "lidar": True, "prior": True}
+        **{"lenses": False, "path": False, "lidar": True, "prior": True, "scan": True}
     }
 
 
 def test_nothing_is_made_without_a_viewer(scene, monkeypatch):
-    for name in ("_lidar", "_prior", "_draw_lenses", "_draw_path"):
+    for name in ("_lidar", "_prior", "_scan", "_draw_lenses", "_draw_path"):
         monkeypatch.setattr(DriveLayers, name, lambda *_: pytest.fail("made"))
     pipeline_of(scene, "test")
 
@@ -608,7 +608,7 @@ def changed(one: np.ndarray, other: np.ndarray) -> int:
 def test_the_page_shows_the_scene(page, training):
     picture = settled(page)
     assert picture.std(axis=(0, 1)).max() > 5  # not blank
-    for label in ("Lenses", "Path", "LiDAR points", "Depth prior", "Detail of training pictures"):
+    for label in ("Lenses", "Path", "LiDAR points", "Depth prior", "Rendered scan", "Detail of training pictures"):
         assert page.get_by_label(label).count() == 1, label
     until(lambda: "distance_coloured" in training.viewer.control_panel._output_render.options)
 

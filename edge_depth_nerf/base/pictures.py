@@ -93,6 +93,8 @@ RELATIVE_ERROR = ColourScale(
     logarithmic=False,
 )
 """Relative errors of a distance in percent: too near is blue, too far is red."""
+HEIGHT = ColourScale(-2.0, 5.0, _opencv_colours(cv2.COLORMAP_TURBO), (-2.0, 0.0, 5.0), "m", logarithmic=False)
+"""Heights above a scanner: low is blue, high is red."""
 COLOUR_ERROR = ColourScale(
     0.0, 25.0, _opencv_colours(cv2.COLORMAP_INFERNO), (0.0, 5.0, 10.0, 15.0, 20.0, 25.0), "%", logarithmic=False
 )

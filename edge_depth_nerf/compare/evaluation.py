@@ -31,8 +31,8 @@ from edge_depth_nerf.method.metrics import (
 )
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
 from edge_depth_nerf.plugin.detail import detail_shown
+from edge_depth_nerf.plugin.evaluation import evaluated
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
-from edge_depth_nerf.plugin.pipeline import evaluated
 from edge_depth_nerf.report.compared_views import BY_VIEW
 from edge_depth_nerf.scene.format import read_transforms
 

@@ -38,6 +38,7 @@ STYLES: dict[MethodName, tuple[str, str, str, str]] = {
     "edge": ("#d62828", "#ff625c", "-", "o"),
 }
 BINS = {"by_angle_deg": "angle from the optical axis, degrees", "by_distance_m": "distance, m"}
+SCANS = "scan_within"
 DISTANCE_ERRORS = ("truth_abs_rel", "lidar_abs_rel")
 """Of a curve's points: the better one first."""
 _INK = {False: "#1b2026", True: "#d5dae0"}
@@ -175,8 +176,22 @@ def _binned(results: Results, scenes: Sequence[str], title: str, key: str) -> Pl
     return plot_lines(title, _lines(results, scenes, rows, line), BINS[key], rows, key == "by_distance_m")
 
 
+def _of_scans(results: Results, scenes: Sequence[str], title: str) -> Plot:
+    """Plot the share of a held-out scan's rays over the error that they have at most."""
+
+    def line(runs: Sequence[RunResult], name: str) -> Line | None:
+        of_runs = [run.content[SCANS] for run in runs if SCANS in run.content]
+        if not of_runs:
+            return None
+        shares = np.mean([[100 * entry[name] for entry in each] for each in of_runs], axis=0)
+        return [entry["error_m"] for entry in of_runs[0]], shares.tolist()
+
+    rows = [("share", "share of the rays, %")]
+    return plot_lines(title, _lines(results, scenes, rows, line), "largest error of the distance, m", rows)
+
+
 def draw_plots(output: Path, results: Results) -> list[Plot]:
-    """Draw psnr_by_steps, psnr_by_seconds, error_by_angle and error_by_distance.
+    """Draw psnr_by_steps, psnr_by_seconds, error_by_angle, error_by_distance and, of held-out scans, error_of_scans.
 
     Returns:
         For the page: each plot of each drive.
@@ -192,6 +207,8 @@ def draw_plots(output: Path, results: Results) -> list[Plot]:
         ),
         "error_by_distance": lambda of, more: _binned(results, of, f"Errors by distance{more}", "by_distance_m"),
     }
+    if any(SCANS in run.content for run in results.runs):
+        kinds["error_of_scans"] = lambda of, more: _of_scans(results, of, f"Errors of held-out scans{more}")
     for_the_page = []
     for name, plot in kinds.items():
         of_all = plot(scenes, "")

@@ -40,7 +40,7 @@ from edge_depth_nerf.compare.specification import FIGURES, PROGRESS, SPECIFICATI
 from edge_depth_nerf.jobs.runs import end_with_parent, steps_done
 from edge_depth_nerf.jobs.tasks import WORK
 from edge_depth_nerf.mono.calibration import maps_trained_on
-from edge_depth_nerf.plugin.pipeline import evaluated
+from edge_depth_nerf.plugin.evaluation import evaluated
 from edge_depth_nerf.plugin.scanning import evaluate_scans
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 from edge_depth_nerf.scene.format import LAYERS, read_transforms
@@ -227,8 +227,8 @@ def do_run(folder: Path) -> None:
         found, bins = evaluator.held_out(folder / VIEWS)
         figures |= found | evaluator.shifted(beside) | evaluate_beams(trainer.pipeline)
         with evaluated(trainer.pipeline.model):
-            of_scans, bins["scan_parts"] = evaluate_scans(trainer.pipeline, read_scene(Path(run.scene)))
-        figures |= of_scans
+            of_scans, parts = evaluate_scans(trainer.pipeline, read_scene(Path(run.scene)))
+        figures, bins = figures | of_scans, bins | parts
         if run.detail:
             figures |= evaluator.with_detail(folder / VIEWS, beside)
     weight, sigma = setting_of(config, run.method)

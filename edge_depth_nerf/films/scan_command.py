@@ -6,7 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
+from numpy.typing import NDArray
 from rich.console import Console
 
 from edge_depth_nerf import __version__
@@ -14,9 +15,11 @@ from edge_depth_nerf.base.console import progress_bars, say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import open_folder, write_json, write_text
 from edge_depth_nerf.cameras.transforms import rigid
+from edge_depth_nerf.films.intensities import Intensities
 from edge_depth_nerf.films.paths import CameraPath, lane_shift
 from edge_depth_nerf.films.placed import outside, placed
 from edge_depth_nerf.films.scan_files import Scan, write_scan
+from edge_depth_nerf.films.scan_film import ScanFilm
 from edge_depth_nerf.films.scan_options import RenderLidarOptions
 from edge_depth_nerf.films.scanning import RayDrop, evaluate, learn_ray_drop, load_model, recorded_pattern, scan
 from edge_depth_nerf.lidar.patterns import SENSORS, TEN_TURNS, ScanPattern, pattern_of_scan, rings_of
@@ -26,9 +29,9 @@ from edge_depth_nerf.plugin.compat import quiet_host
 from edge_depth_nerf.plugin.scanning import Caster
 from edge_depth_nerf.process.poses import read_tum, tum_text
 from edge_depth_nerf.scene.reader import SceneFolder
-from edge_depth_nerf.scene.sweeps import SceneScanner, scanners_of
+from edge_depth_nerf.scene.sweeps import UNKNOWN_RING, SceneScanner, scanners_of
 
-RECORD, POSES, FIGURES = "scans.json", "poses.txt", "figures.json"
+RECORD, POSES, FIGURES, FILM = "scans.json", "poses.txt", "figures.json", "scans.webp"
 UP = np.array([0.0, 0.0, 1.0])
 _WORDS = {
     "sweeps": "Held-out sweeps",
@@ -77,13 +80,17 @@ def render_lidar(options: RenderLidarOptions, console: Console | None = None) ->
     if scanner is not None and recorded is not None:
         with console.status("Learning which rays come back"):
             ray_drop = learn_ray_drop(caster, scanner, recorded)
-    _render(output, options, caster, pattern, ray_drop, times_s, poses, console)
+    with console.status("Learning how bright places are"):
+        intensities = None if scanner is None else Intensities.learned(scanner)
+    _render(output, options, caster, pattern, ray_drop, intensities, pattern is recorded, times_s, poses, console)
     _write_poses(output / POSES, scene, times_s[:: options.every], poses[:: options.every])
     say(console, f"{len(times_s[:: options.every])} scans of {len(pattern.elevation_rad)} × {pattern.firings} rays:")
     say(console, f"  {output}")
+    if options.film:
+        _film(output, options, times_s, console)
     if scanner is not None:
         with console.status("Comparing with what no training saw"):
-            figures = evaluate(caster, scene, scanner, recorded, ray_drop)
+            figures = evaluate(caster, scene, scanner, recorded, ray_drop, intensities)
         write_json(output / FIGURES, figures)
         _show(figures, console)
     return output
@@ -159,6 +166,8 @@ def _render(
     caster: Caster,
     pattern: ScanPattern,
     ray_drop: RayDrop,
+    intensities: Intensities | None,
+    own: bool,
     times_s: Float64[np.ndarray, "scans"],
     poses: Float64[np.ndarray, "scans 4 4"],
     console: Console,
@@ -170,15 +179,40 @@ def _render(
     with progress_bars(console, counted=True) as progress:
         task = progress.add_task("Rendering scans", total=len(numbers), completed=len(numbers) - len(missing))
         for number in missing:
-            cast, _, _ = scan(caster, pattern, float(times_s[number]), path)
+            cast, origins, directions = scan(caster, pattern, float(times_s[number]), path)
             kept = ray_drop.kept(cast, pattern.reach_m)
             # in the order of time: firing by firing
             firing, ring = np.nonzero(kept.T)
-            points_m = pattern.directions[ring, firing] * cast.distance_m[ring, firing][:, None]
-            offset_s = pattern.offset_s[firing].astype(np.float32)
-            rendered = Scan(points_m.astype(np.float32), offset_s, ring.astype(np.int16))
+            distance_m = cast.distance_m[ring, firing][:, None]
+            met_m = origins[firing] + directions[ring, firing] * distance_m
+            rendered = Scan(
+                (pattern.directions[ring, firing] * distance_m).astype(np.float32),
+                pattern.offset_s[firing].astype(np.float32),
+                ring.astype(np.int16),
+                _bright(intensities, met_m, ring if own else None, distance_m[:, 0]),
+            )
             write_scan(output / f"{number:010d}.{options.form}", rendered)
             progress.advance(task)
+
+
+def _bright(
+    intensities: Intensities | None, met_m: NDArray, ring: NDArray | None, distance_m: NDArray
+) -> Float32[np.ndarray, "points"] | None:
+    """Give the intensities of a scan's points; None where they are unknown. Another scanner's rings say nothing."""
+    if intensities is None or not len(met_m):
+        return None
+    return intensities.at(met_m, np.full(len(met_m), UNKNOWN_RING) if ring is None else ring, distance_m)
+
+
+def _film(output: Path, options: RenderLidarOptions, times_s: Float64[np.ndarray, "scans"], console: Console) -> None:
+    """Write the film of all scans, from their files."""
+    film = ScanFilm(float(np.median(np.diff(times_s[:: options.every]))) if len(times_s) > options.every else 0.1)
+    with progress_bars(console, counted=True) as progress:
+        for number in progress.track(range(0, len(times_s), options.every), description="Drawing the film"):
+            path = output / f"{number:010d}.{options.form}"
+            film.add(read_scan(path, ScanFormat()).points_m.numpy())
+    film.write(output / FILM)
+    say(console, f"  {output / FILM}")
 
 
 def _write_poses(
@@ -203,4 +237,6 @@ def _show(figures: dict[str, dict[str, float]], console: Console) -> None:
             text += (
                 f" Rays that are lost: F1 {found['drop_f1']:.2f}. Chamfer distance: {100 * found['chamfer_m']:.1f} cm."
             )
+        if "intensity_error" in found:
+            text += f" Intensities are off by {found['intensity_error']:.0%} of their usual difference from the median."
         say(console, text)

@@ -25,22 +25,28 @@ class Scan:
     """When, counted from the scan's own time."""
     ring: Int16[np.ndarray, "points"]
     """From the highest, 0, to the lowest."""
+    intensity: Float32[np.ndarray, "points"] | None = None
+    """In the recording's unit; None: the scanner measures none."""
 
 
 def _records(scan: Scan) -> NDArray:
     kinds = [*((axis, "<f4") for axis in "xyz"), ("time", "<f4"), ("ring", "<u2")]
-    return unstructured_to_structured(np.column_stack((scan.points_m, scan.offset_s, scan.ring)), np.dtype(kinds))
+    columns = [scan.points_m, scan.offset_s, scan.ring]
+    if scan.intensity is not None:
+        kinds, columns = [*kinds, ("intensity", "<f4")], [*columns, scan.intensity]
+    return unstructured_to_structured(np.column_stack(columns), np.dtype(kinds))
 
 
 def _pcd(scan: Scan) -> bytes:
     rows = _records(scan)
+    kinds = [rows.dtype[name] for name in rows.dtype.names or ()]
     header = [
         "# .PCD v0.7",
         "VERSION 0.7",
-        "FIELDS x y z time ring",
-        "SIZE 4 4 4 4 2",
-        "TYPE F F F F U",
-        "COUNT 1 1 1 1 1",
+        f"FIELDS {' '.join(rows.dtype.names or ())}",
+        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}",
+        f"TYPE {' '.join(kind.kind.upper() for kind in kinds)}",
+        f"COUNT {' '.join('1' for _ in kinds)}",
         f"WIDTH {len(rows)}",
         "HEIGHT 1",
         "VIEWPOINT 0 0 0 1 0 0 0",
@@ -50,10 +56,15 @@ def _pcd(scan: Scan) -> bytes:
     return "\n".join(header).encode() + rows.tobytes()
 
 
+def _bin(scan: Scan) -> bytes:
+    intensity = np.zeros(len(scan.ring), np.float32) if scan.intensity is None else scan.intensity
+    return np.column_stack((scan.points_m, intensity)).astype("<f4").tobytes()
+
+
 _WRITERS: dict[str, Callable[[Scan], bytes]] = {
     "ply": lambda scan: ply_bytes(_records(scan)),
     "pcd": _pcd,
-    "bin": lambda scan: np.pad(scan.points_m.astype("<f4"), ((0, 0), (0, 1))).tobytes(),
+    "bin": _bin,
 }
 
 

@@ -33,7 +33,9 @@ class RenderLidarOptions:
     every: int = 1
     """Render one of so many scans."""
     form: ScanForm = "ply"
-    """The files' format. bin: float32 x, y, z, 0, as KITTI has it, without times."""
+    """The files' format. bin: float32 x, y, z, intensity, as KITTI has it, without times."""
+    film: bool = False
+    """Also write the scans as a film, scans.webp."""
     output: Path | None = None
     """The folder. Not set: scans/ beside config.yml."""
 

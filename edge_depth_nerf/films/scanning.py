@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.numbers import spread_over
+from edge_depth_nerf.films.intensities import Intensities
 from edge_depth_nerf.lidar.patterns import ScanPattern, pattern_of_scan
 from edge_depth_nerf.lidar.sweeps import MIN_RANGE_M
 from edge_depth_nerf.lidar.trajectory import Trajectory
@@ -144,7 +145,12 @@ def chamfer_m(points_m: Float[np.ndarray, "points 3"], others_m: Float[np.ndarra
 
 
 def evaluate(
-    caster: Caster, scene: SceneFolder, scanner: SceneScanner, pattern: ScanPattern | None, ray_drop: RayDrop
+    caster: Caster,
+    scene: SceneFolder,
+    scanner: SceneScanner,
+    pattern: ScanPattern | None,
+    ray_drop: RayDrop,
+    intensities: Intensities | None,
 ) -> dict[str, dict[str, float]]:
     """Hold the model against what no training saw: held-out sweeps, and held-out beams of the others.
 
@@ -153,20 +159,31 @@ def evaluate(
     Returns:
         Figures of `sweeps` and `beams`, where there are any, and the same of `…_in_pictures`, the rays that end inside
         a picture of their frame. With a pattern those of sweeps have also `drop_f1` (of rays that did not come back)
-        and `chamfer_m` between the whole rendered scan and the recorded one.
+        and `chamfer_m` between the whole rendered scan and the recorded one. Where intensities are known, those of
+        `sweeps_in_pictures` have also `intensity_error`, the mean error as a share of the mean difference of recorded
+        intensities from their median.
     """
     lengths: dict[str, list[tuple[NDArray, NDArray]]] = {}
     more: list[dict[str, float]] = []
+    bright: list[tuple[NDArray, NDArray]] = []
     for kind, sweep, rays, counts in held_out_sweeps(scanner):
         chosen = some_of(counts)
         both = rays.distance_m[chosen], caster.cast_at(rays, chosen)
         shown = in_pictures(scene, sweep, rays)[chosen]
         for name, part in ((kind, slice(None)), (f"{kind}_in_pictures", shown)):
             lengths.setdefault(name, []).append((both[0][part], both[1][part]))
+        if intensities is not None and kind == "sweeps" and shown.any():
+            asked = chosen[shown]
+            met_m = rays.origin_m[asked] + rays.direction[asked] * both[1][shown][:, None]
+            bright.append((rays.intensity[asked], intensities.at(met_m, rays.ring[asked], both[1][shown])))
         if pattern is not None and kind == "sweeps":
             more.append(_of_whole(caster, scanner.trajectory, sweep, rays, pattern, ray_drop))
     together = {name: tuple(map(np.concatenate, zip(*each, strict=True))) for name, each in lengths.items()}
     found = {name: errors(*both) for name, both in together.items() if len(both[0])}
+    if bright:
+        recorded, rendered = map(np.concatenate, zip(*bright, strict=True))
+        if usual := float(np.abs(recorded - np.median(recorded)).mean()):
+            found["sweeps_in_pictures"]["intensity_error"] = float(np.abs(rendered - recorded).mean()) / usual
     if more:
         found["sweeps"] |= {key: float(np.mean([each[key] for each in more])) for key in more[0]}
     return found

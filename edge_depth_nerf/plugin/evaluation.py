@@ -1,11 +1,12 @@
-"""Figures of a rendered view, and depth errors pooled over views.
+"""Figures of a rendered view, depth errors pooled over views, and a model as evaluation needs it.
 
 Host-facing; formulas stand in `method.metrics`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -13,6 +14,24 @@ from jaxtyping import Float
 from torch import Tensor
 
 from edge_depth_nerf.method.metrics import DepthErrors, load_lpips, masked_lpips, masked_psnr, masked_ssim
+
+
+@contextmanager
+def evaluated(model: Any) -> Iterator[None]:
+    """Let a model in training be evaluated as after loading it, without any trace in the training."""
+    sampler = model.proposal_sampler
+    kept = {name: getattr(sampler, name) for name in ("_anneal", "_steps_since_update")}
+    was_training = model.training
+    model.eval()
+    # what a loaded model has; a training reaches it after its first hundreds of steps
+    sampler.set_anneal(1.0)
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        for name, value in kept.items():
+            setattr(sampler, name, value)
+        model.train(was_training)
 
 
 class Psnr(torch.nn.Module):

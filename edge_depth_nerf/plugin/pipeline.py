@@ -6,8 +6,7 @@ nerfstudio would average depth errors over pictures.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from edge_depth_nerf.plugin.compat import allow_numpy_scalars_in_checkpoints, ig
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager, FisheyeDepthDataManagerConfig
 from edge_depth_nerf.plugin.dataparser import transforms_path
 from edge_depth_nerf.plugin.detail import TrainingDetail
+from edge_depth_nerf.plugin.evaluation import evaluated
 from edge_depth_nerf.plugin.fused.build import kernels_prepared
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
@@ -60,24 +60,6 @@ class EdgeDepthPipelineConfig(VanillaPipelineConfig):
         say_errors_plainly()
         ignore_deprecations_of_host()
         return super().setup(**kwargs)
-
-
-@contextmanager
-def evaluated(model: EdgeDepthNerfModel) -> Iterator[None]:
-    """Let a model in training be evaluated as after loading it, without any trace in the training."""
-    sampler = model.proposal_sampler
-    kept = {name: getattr(sampler, name) for name in ("_anneal", "_steps_since_update")}
-    was_training = model.training
-    model.eval()
-    # what a loaded model has; a training reaches it after its first hundreds of steps
-    sampler.set_anneal(1.0)
-    try:
-        with torch.no_grad():
-            yield
-    finally:
-        for name, value in kept.items():
-            setattr(sampler, name, value)
-        model.train(was_training)
 
 
 class NotFiniteError(InputError):

@@ -31,6 +31,8 @@ PARTS = {
     "roughness": (0.0, FOLIAGE, np.inf),
 }
 """Edges of the parts that rays are told apart by."""
+WITHIN_M = np.geomspace(0.01, 10, 13)
+"""Errors whose shares are kept."""
 _PIXEL_AREA = 1e-6
 """Of a beam at distance 1; nerfacto does not use it."""
 
@@ -175,12 +177,13 @@ def in_pictures(scene: SceneFolder, sweep: SceneSweep, rays: SweepRays) -> Bool[
     return found
 
 
-def evaluate_scans(pipeline: Any, scene: SceneFolder) -> tuple[dict[str, float], list[dict[str, Any]]]:
+def evaluate_scans(pipeline: Any, scene: SceneFolder) -> tuple[dict[str, float], dict[str, list[dict[str, Any]]]]:
     """Hold a trained pipeline against the rays of held-out sweeps that a camera could see, 1 to 60 m.
 
     Returns:
-        The figures of `errors`, as scan_median_m and so on, of foliage as scan_foliage_…; and the same in the parts
-        of `PARTS`, each with by, low and high. Both are empty without such rays.
+        The figures of `errors`, as scan_median_m and so on, of foliage as scan_foliage_…; and, as scan_parts, the same
+        in the parts of `PARTS`, each with by, low and high, and as scan_within the share of rays whose error is at
+        most error_m. Without such rays there is nothing.
     """
     outputs = pipeline.datamanager.train_dataset._dataparser_outputs
     caster = Caster(pipeline.model, SceneToModel.of(outputs, scene.meta))
@@ -201,7 +204,7 @@ def evaluate_scans(pipeline: Any, scene: SceneFolder) -> tuple[dict[str, float],
             values["elevation_deg"].append(np.rad2deg(np.arcsin(np.clip(upward, -1, 1))))
             values["roughness"].append(roughness(rays.distance_m, rays.ring, rays.offset_s)[chosen])
     if not measured:
-        return {}, []
+        return {}, {}
     true_m, found_m = np.concatenate(measured), np.concatenate(rendered)
     by = {"distance_m": true_m, **{name: np.concatenate(each) for name, each in values.items()}}
     parts: list[dict[str, Any]] = []
@@ -214,4 +217,8 @@ def evaluate_scans(pipeline: Any, scene: SceneFolder) -> tuple[dict[str, float],
     foliage = by["roughness"] >= FOLIAGE
     if foliage.any():
         figures |= {f"foliage_{name}": value for name, value in errors(true_m[foliage], found_m[foliage]).items()}
-    return {f"scan_{name}": value for name, value in figures.items()}, parts
+    off_m = np.abs(found_m - true_m)
+    within: list[dict[str, Any]] = [
+        {"error_m": float(most_m), "share": float((off_m <= most_m).mean())} for most_m in WITHIN_M
+    ]
+    return {f"scan_{name}": value for name, value in figures.items()}, {"scan_parts": parts, "scan_within": within}

@@ -1,4 +1,4 @@
-"""Additional layers in nerfstudio's viewer: LiDAR points, the prior, the path, the lenses.
+"""Additional layers in nerfstudio's viewer: LiDAR points, the prior, a rendered scan, the path, the lenses.
 
 Host-facing, through nerfstudio's own hooks: nerfstudio finds the `ViewerControl` in the pipeline, and the control
 installs the switches. A layer is made in a thread of its own when it is first switched on. Switching it off hides it.
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -34,6 +35,9 @@ from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import DISTANCE, SIGMA
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.plugin.coarse_to_fine import render_coarse_to_fine
+from edge_depth_nerf.plugin.evaluation import evaluated
+from edge_depth_nerf.plugin.scanning import Caster, SceneToModel, some_of
+from edge_depth_nerf.scene.sweeps import SCANNERS, scanners_of
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
@@ -80,7 +84,7 @@ class Cloud:
     height_m: Float[np.ndarray, "n"]
     """Height above the scene's origin."""
     sigma_m: Float[np.ndarray, "n"] | None
-    """Standard deviation of the prior; LiDAR has none."""
+    """Standard deviation of the prior, or error of a rendered scan; LiDAR has none."""
 
     def colours(self, meaning: str) -> UInt8[np.ndarray, "n 3"]:
         """Return the points' colours: from the picture, or by sigma or height. Without sigma, by height."""
@@ -187,6 +191,13 @@ class DriveLayers(ViewerControl):
             "prior": self._switch(
                 "Depth prior", "prior", False, "The distances that supervise the training", has_prior
             ),
+            "scan": self._switch(
+                "Rendered scan",
+                "scan",
+                False,
+                "The distances that the model now gives along a recorded sweep, a held-out one if there is any",
+                bool(manager.train_dataset.scene.meta.get(SCANNERS)),
+            ),
             # from inside one, its picture would look like a perfect rendering
             "lenses": self._switch("Lenses", "lenses", False, "What each camera sees; replaces nerfstudio's pyramids"),
             "path": self._switch("Path", "path", True, "A line through the positions of each camera"),
@@ -196,7 +207,7 @@ class DriveLayers(ViewerControl):
             COLOURS[0],
             list(COLOURS),
             cb_hook=lambda _: self._recolour(),
-            hint="Sigma of the prior: dark is certain (0.05 m), bright is uncertain (20 m)",
+            hint="Sigma of the prior, or the error of the scan: dark is 0.05 m, bright is 20 m",
         )
         self.detail = ViewerCheckbox(
             "Detail of training pictures",
@@ -284,7 +295,7 @@ class DriveLayers(ViewerControl):
             elif layer == "path":
                 self._draw_path(node)
             else:
-                self._clouds[layer] = self._lidar() if layer == "lidar" else self._prior()
+                self._clouds[layer] = {"lidar": self._lidar, "prior": self._prior, "scan": self._scan}[layer]()
                 self._draw_cloud(layer)
         except (InputError, OSError) as error:
             CONSOLE.print(f"The viewer cannot show this layer ({layer}). {error}", style="yellow", markup=False)
@@ -369,6 +380,23 @@ class DriveLayers(ViewerControl):
         colours = (batch.rgb[known].numpy() * 255).round().astype(np.uint8)
         distance_m, sigma_m = (values[known, 0].numpy() for values in (batch.prior_distance_m, batch.prior_sigma_m))
         return self._cloud(batch.indices[known].numpy(), distance_m, colours, sigma_m)
+
+    def _scan(self) -> Cloud:
+        """Cast the rays of a recorded sweep into the present model; sigma is their error."""
+        dataset, model = self.manager.train_dataset, self.viewer.pipeline.model
+        scanners = scanners_of(dataset.scene.meta, dataset.scene.path).values()
+        sweeps = [sweep for scanner in scanners for sweep in scanner.sweeps]
+        sweeps = [sweep for sweep in sweeps if sweep.held_out] or sweeps
+        rays, place = sweeps[len(sweeps) // 2].read(), SceneToModel.of(dataset._dataparser_outputs, dataset.scene.meta)
+        chosen = some_of(np.ones(len(rays.ring), bool))
+        origin_m, along = (each[chosen].astype(np.float64) for each in (rays.origin_m, rays.direction))
+        with self.viewer.train_lock or nullcontext(), evaluated(model):
+            cast = Caster(model, place).cast(origin_m, along)
+        points_m = origin_m + along * cast.distance_m[:, None]
+        error_m = np.abs(cast.distance_m - rays.distance_m[chosen])
+        rgb = np.zeros((len(chosen), 3)) if cast.rgb is None else cast.rgb.clip(0, 1)
+        colours = (255 * rgb).round().astype(np.uint8)
+        return Cloud(place.points(points_m).astype(np.float32), colours, points_m[:, 2], error_m)
 
     def _cloud(
         self,

@@ -95,7 +95,7 @@ def mark_best(rows: Sequence[Row], better: Sequence[int]) -> None:
         cells = [row.cells[column] for row in rows if row.cells[column].mean is not None]
         if sign and len(cells) > 1:
             texts = {cell.text().split(" ")[0]: cell for cell in cells}
-            best = max(texts, key=lambda text: sign * float(text))
+            best = max(texts, key=lambda text: sign * float(text.rstrip("%")))
             for cell in cells:
                 cell.best = cell.text().split(" ")[0] == best
 
