@@ -3,8 +3,8 @@
 python docs/make_viewer_picture.py --load-config outputs/sample_drive/edge-depth-nerf-lite/DATE/config.yml
 
 The scene is copied without its `.cache`, so that what earlier trainings left there is not seen. It needs Chromium and
-Playwright (`pip install playwright`). What is seen depends on the training; the picture in the repository is of
-`make demo` (ours, 800 steps), with `detail: true` in its config.yml.
+Playwright (`pip install playwright`). What is seen depends on the training; the picture in the repository is of the
+rendered street of docs/results.md (ours, 1,000 steps), with `detail: true` in its config.yml.
 """
 
 from __future__ import annotations
