@@ -32,7 +32,7 @@ from edge_depth_nerf.plugin.config import make_specifications, read_method_file
 
 LOSS, SOURCE = "pipeline.model.depth_loss", "pipeline.datamanager.depth_source"
 PRIOR = "pipeline.datamanager.prior."
-EXPOSURE = "pipeline.model.exposure"
+EXPOSURE, SHARP = "pipeline.model.exposure", "pipeline.model.depth_loss_sharp"
 EXTRAS = {
     "pipeline.model.surface_loss_mult",
     "pipeline.datamanager.surface_rays_per_batch",
@@ -61,7 +61,7 @@ def allowed(method: Method) -> set[str]:
     """What a method may have otherwise than `edge`."""
     of_loss = {"none": {LAMBDA} if method.extras else {LOSS}, "edge": set()}
     return {
-        *{"": (), "paper": PAPER, "embedding": {EXPOSURE}}[method.variant],
+        *{"": (), "paper": PAPER, "embedding": {EXPOSURE}, "sharp": {SHARP}}[method.variant],
         *(() if method.extras else EXTRAS),
         *{"integrated": set(), "gaussian": {KERNEL}}.get(method.prior or "", {SOURCE}),
         *of_loss.get(method.loss, {LOSS, LAMBDA, SIGMA_FIELDS.get(method.loss, "")}),
@@ -148,6 +148,7 @@ def test_each_method_is_what_its_name_says():
     assert resolved("nerfacto")[LOSS] == resolved("nerfacto-embedding")[LOSS] == "none"
     for name, field in (("lidar", SOURCE), ("mono", SOURCE), ("gaussian", KERNEL)):
         assert {*differing(resolved("edge-paper"), resolved(f"edge-paper-{name}"))} == {field}, name
+    assert differing(resolved("edge"), resolved("edge-sharp")).keys() == {SHARP}
 
 
 @pytest.mark.parametrize("preset", ["lite", "full"])

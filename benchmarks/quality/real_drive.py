@@ -36,10 +36,10 @@ from edge_depth_nerf.report.compared_views import compared_view, held_out_frames
 
 RIVALS: tuple[MethodName, ...] = ("nerfacto", "urban-nerf", "ds-nerf")
 WITH_PRIOR: MethodName = "ds-nerf-integrated-extras"
-TABLE: tuple[MethodName, ...] = (*RIVALS, WITH_PRIOR, "edge-paper", "edge")
+TABLE: tuple[MethodName, ...] = (*RIVALS, WITH_PRIOR, "edge-paper", "edge", "edge-sharp")
 CELLS: tuple[MethodName, ...] = ("edge-plain", "edge-lidar")
 """Methods that differ from ours in extras or prior alone."""
-TUNED_AS: dict[MethodName, MethodName] = {WITH_PRIOR: "ds-nerf", "edge-plain": "edge"}
+TUNED_AS: dict[MethodName, MethodName] = {WITH_PRIOR: "ds-nerf", "edge-plain": "edge", "edge-sharp": "edge"}
 """Whose λ and σ a method takes that the search did not have: those of its loss."""
 SIZES = {1: "full", 2: "half"}
 HOLDOUT = ("--holdout-every", "6", "--holdout-beams", "10")

@@ -38,6 +38,7 @@ SHORT_TITLES = {
     "nerfacto-embedding": "nerfacto, appearance embedding",
     "edge-paper": "as published",
     "edge": "ours",
+    "edge-sharp": "ours, LiDAR keeps its weight",
 }
 EXTRAS_TITLES = {False: "without extras", True: "with extras"}
 """What the tables call losses, priors and extras, and methods as they usually are."""
@@ -70,15 +71,15 @@ class Method:
     """gaussian: integrated by the kernel without a depth factor. None: it uses none."""
     extras: bool
     """Whether it has surface, sky and a λ that falls."""
-    variant: Literal["", "embedding", "paper"] = ""
+    variant: Literal["", "embedding", "paper", "sharp"] = ""
     """embedding: nerfstudio's own exposure model; paper: the published method to the letter, what the preset paper sets
-    beyond the size of full."""
+    beyond the size of full; sharp: ours, whose λ stays where the prior is as sure as LiDAR."""
 
     @property
     def _usual(self) -> Method:
         """The one with the prior and the extras that a name leaves out."""
         if self.loss == "edge":
-            return replace(self, prior="integrated", extras=not self.variant)
+            return replace(self, prior="integrated", extras=self.variant != "paper")
         return replace(self, prior=None if self.loss == "none" else "lidar", extras=False)
 
     @cached_property
@@ -118,6 +119,7 @@ class Method:
             "pipeline.datamanager.depth_source": source,
             **(kernel if self.prior == "gaussian" else {}),
             **({"pipeline.model.exposure": "embedding"} if self.variant == "embedding" else {}),
+            **({"pipeline.model.depth_loss_sharp": 0.02} if self.variant == "sharp" else {}),
             **({} if self.extras else WITHOUT_EXTRAS),
         }
 
@@ -136,6 +138,8 @@ class Method:
     @property
     def by_default(self) -> bool:
         """Whether it is compared though nobody names it: each loss as usual, and ours with each prior."""
+        if self.variant == "sharp":
+            return False
         return self == self._usual or (self.loss == "edge" and self.extras and not self.variant)
 
 
@@ -149,6 +153,7 @@ def _every() -> Iterator[Method]:
             yield Method(loss, prior, extras)
     for prior in get_args(PriorName):
         yield Method("edge", prior, False, "paper")
+    yield Method("edge", "integrated", True, "sharp")
 
 
 METHODS: dict[MethodName, Method] = {

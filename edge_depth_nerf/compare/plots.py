@@ -35,6 +35,7 @@ STYLES: dict[MethodName, tuple[str, str, str, str]] = {
     "edge-mono": ("#8ab17d", "#a9d39a", ":", "D"),
     "edge-gaussian": ("#9b5de5", "#bb92f5", "-.", "P"),
     "edge-paper": ("#3a86ff", "#70a9ff", "-.", "X"),
+    "edge-sharp": ("#e07a1f", "#ffae57", "-", "^"),
     "edge": ("#d62828", "#ff625c", "-", "o"),
 }
 BINS = {"by_angle_deg": "angle from the optical axis, degrees", "by_distance_m": "distance, m"}

@@ -345,7 +345,7 @@ def make_tables(results: Results) -> list[MadeTable]:
     of_jbnu = [scene for scene in everywhere if kinds[scene] == JBNU]
     # each loss with each prior and extras that was trained; the last two have ours with one thing changed
     of_other_losses = [name for name, method in METHODS.items() if method.loss != "edge" and not method.variant]
-    rivals = ["nerfacto-embedding", *of_other_losses, "edge-paper", "edge"]
+    rivals = ["nerfacto-embedding", *of_other_losses, "edge-paper", "edge", "edge-sharp"]
     of_the_paper = ", drives of KITTI-360's kind" if {*kinds.values()} <= {KITTI360, JBNU} else ""
     wanted = [
         ("1", f"Rivals{of_the_paper}", [scene for scene in everywhere if scene not in of_jbnu], rivals, []),
