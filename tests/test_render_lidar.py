@@ -350,6 +350,10 @@ def test_each_beam_is_as_bright_as_it_measures_at_its_range():
     # another scanner's: between the two
     between = found.at(there, np.full(1000, -1), away_m) / measured(there, np.zeros(1000), away_m)
     assert 0.8 < between.min() and between.max() < 3 and 1.3 < between.mean() < 2.2
+    # a scanner whose rings cannot be told apart
+    ringless = Intensities(points_m, measured(points_m, 0 * ring, distance_m), 0 * ring - 1, distance_m)
+    off = ringless.at(there, np.full(1000, -1), away_m) / measured(there, np.zeros(1000), away_m) - 1
+    assert np.median(np.abs(off)) < 0.02
 
 
 def test_a_film_shows_each_scan(trained):

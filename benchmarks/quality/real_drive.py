@@ -68,9 +68,7 @@ SCANS = (
     Column("median, cm", "scan_median_m", ".1f", 100),
     Column("within 30 cm, %", "scan_within_30_cm", ".1f", 100),
     Column("AbsRel", "scan_abs_rel", ".3f"),
-    Column("25 % too far, %", "scan_far_25", ".1f", 100),
     Column("foliage: AbsRel", "scan_foliage_abs_rel", ".3f"),
-    Column("foliage: 25 % too far, %", "scan_foliage_far_25", ".1f", 100),
 )
 """Of the rays of held-out sweeps."""
 

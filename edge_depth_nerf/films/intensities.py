@@ -84,7 +84,9 @@ class Intensities:
         if not parts:
             return None
         points_m, intensity, ring, distance_m = (np.concatenate(each) for each in zip(*parts, strict=True))
-        return None if np.ptp(intensity) == 0 else cls(points_m, intensity, ring, distance_m)
+        if not len(intensity) or np.ptp(intensity) == 0:
+            return None
+        return cls(points_m, intensity, ring, distance_m)
 
     def at(
         self,
