@@ -120,6 +120,9 @@ def dashed(name: str) -> str:
     return name.replace("_", "-")
 
 
+COLUMNS = ("option", "values; default", "what")
+
+
 def is_marked(hint: Any, marker: Any) -> bool:
     """Whether a field has a marker of tyro's: `Positional` (given without its name) or `Suppress` (no option)."""
     return get_origin(hint) is Annotated and get_args(marker[str])[1] in get_args(hint)[1:]
@@ -136,10 +139,15 @@ def _prose(text: str) -> str:
     return re.sub(r"\bdocs/(\w+\.md)", r"[\1](\1)", text.replace("<", "&lt;").replace("*", "\\*"))
 
 
-def table(rows: list[tuple[str, ...]], header: tuple[str, ...]) -> str:
+def table(rows: list[tuple[str, ...]]) -> str:
     """A table in Markdown."""
-    head, *body = (f"| {' | '.join(line)} |\n" for line in [header, *rows])
-    return f"{head}|{'---|' * len(header)}\n{''.join(body)}\n"
+    head, *body = (f"| {' | '.join(line)} |\n" for line in [COLUMNS, *rows])
+    return f"{head}|{'---|' * len(COLUMNS)}\n{''.join(body)}\n"
+
+
+def values_and(default: str, hint: Any) -> str:
+    """What an option takes, and its default."""
+    return f"{kind_of(hint)}; {default}" if default else kind_of(hint)
 
 
 # ---- our own commands ------------------------------------------------------------------------------------------
@@ -180,13 +188,12 @@ def option_rows(cls: type, declared_by: type) -> list[tuple[str, ...]]:
         needed = "needed" if default is dataclasses.MISSING else shown(default)
         if isinstance(default, bool):
             needed = "on" if default else "off"
-        rows.append((name, kind_of(hints[entry.name]), needed, cell(docs[entry.name])))
+        rows.append((name, values_and(needed, hints[entry.name]), cell(docs[entry.name])))
     return rows
 
 
 def own_commands() -> str:
     """The section of `edge-depth-nerf`."""
-    header = ("option", "values", "default", "what")
     found = list(commands())
     groups: dict[type, list[tuple[tuple[str, ...], type]]] = {}
     for words, cls in found:
@@ -201,12 +208,12 @@ def own_commands() -> str:
         ancestors = [[base for base in cls.__mro__ if dataclasses.is_dataclass(base)] for _, cls in members]
         shared = [base for base in ancestors[0] if len(members) > 1 and all(base in each for each in ancestors)]
         for base in shared:
-            text += SHARED + table(option_rows(members[0][1], base), header)
+            text += SHARED + table(option_rows(members[0][1], base))
         for (words, cls), bases in zip(members, ancestors, strict=True):
             rows = [row for base in reversed(bases) if base not in shared for row in option_rows(cls, base)]
             about = " ".join((inspect.getdoc(cls) or "").split())
             text += (f"`edge-depth-nerf {' '.join(words)}`: " if len(members) > 1 else "") + cell(about) + "\n\n"
-            text += table(rows, header) if rows else "It has no options.\n\n"
+            text += table(rows) if rows else "It has no options.\n\n"
     return text
 
 
@@ -247,10 +254,10 @@ def methods() -> str:
                 if value != first:
                     default += f"; {name.removeprefix('edge-depth-nerf-')}: {shown(value)}"
             option = f"`--{dashed(entry.name)}`" if is_parser else f"`--{dashed(full)}`"
-            rows.append((option, kind_of(hints[entry.name]), default, cell(docs[entry.name])))
+            rows.append((option, values_and(default, hints[entry.name]), cell(docs[entry.name])))
         if rows:
             text += f"### {title}\n\n" + (DATAPARSER if is_parser else "")
-            text += table(rows, ("option", "values", "default", "what"))
+            text += table(rows)
     return text + HOSTS_OWN
 
 

@@ -278,7 +278,7 @@ def test_the_page_of_options_has_them_all(capsys, monkeypatch):
         named = set(re.findall(r"(?<![\w-])--[a-z][\w-]+", capsys.readouterr().out)) - {"--help"}
         assert len(named) > 1 or words == ("doctor",)
         assert not [name for name in named if f"`{name}`" not in text], words
-    assert "| `--pipeline.model.depth-loss-mult` | number | `0.01`; paper: `0.003` |" in text
+    assert "| `--pipeline.model.depth-loss-mult` | number; `0.01`; paper: `0.003` |" in text
     assert "datamanager.prior" not in text and "auto-scale-poses" not in text  # what tyro hides
 
 
