@@ -78,7 +78,7 @@ def test_it_leaves_figures_and_a_picture(finished):
     for name, form in SHOWN.items():
         assert f">{results['figures']['ours'][name]:{form}}</td>" in page
     assert page.count('"colour-error": "data:image/webp') == 4 * 2
-    assert page.count('<img src="data:image/svg+xml;base64,') == 4
+    assert page.count('<img src="data:image/svg+xml;base64,') == 5 and "Errors of held-out scans" in page
     for stage, seconds in results["seconds"].items():
         assert f"<dt>{stage.capitalize()}</dt><dd>{seconds}</dd>" in page
 
