@@ -218,7 +218,7 @@ def evaluate_scans(pipeline: Any, scene: SceneFolder) -> tuple[dict[str, float],
     if foliage.any():
         figures |= {f"foliage_{name}": value for name, value in errors(true_m[foliage], found_m[foliage]).items()}
     off_m = np.abs(found_m - true_m)
-    within: list[dict[str, Any]] = [
+    shares: list[dict[str, Any]] = [
         {"error_m": float(most_m), "share": float((off_m <= most_m).mean())} for most_m in WITHIN_M
     ]
-    return {f"scan_{name}": value for name, value in figures.items()}, {"scan_parts": parts, "scan_within": within}
+    return {f"scan_{name}": value for name, value in figures.items()}, {"scan_parts": parts, "scan_within": shares}
