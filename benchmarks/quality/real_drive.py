@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.commands import TUNED, ours
-from benchmarks.quality.unseen import with_spread
+from benchmarks.quality.unseen import title_of, with_spread
 from edge_depth_nerf.base.files import read_json, write_json, write_png, write_text
 from edge_depth_nerf.base.pictures import DISTANCE, colour_bar, draw_points, lay_out, panel
 from edge_depth_nerf.compare.command import RUNS
@@ -129,7 +129,7 @@ def table(results: Results, scene: str, longer: Results | None = None) -> Iterat
         if method == "edge" and longer:
             yield row(f"{METHODS[longer.runs[0].method].title}, as many seconds as ours", longer.runs, timed=True)
         if found := of(results, scene, method):
-            yield row(METHODS[method].title, found, timed=longer is not None)
+            yield row(title_of(method), found, timed=longer is not None)
 
 
 def scans_table(results: Results, scene: str) -> Iterator[str]:
@@ -140,7 +140,7 @@ def scans_table(results: Results, scene: str) -> Iterator[str]:
     yield "|---" * (len(SCANS) + 1) + "|"
     for method in TABLE:
         if found := of(results, scene, method):
-            yield row(METHODS[method].title, found, timed=False, columns=SCANS)
+            yield row(title_of(method), found, timed=False, columns=SCANS)
 
 
 def of(results: Results, scene: str, method: MethodName) -> list[RunResult]:
