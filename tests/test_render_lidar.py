@@ -1,6 +1,7 @@
 """The scanners' own rays in a scene, and scans rendered of it: a room whose every distance is known in closed form."""
 
 import math
+import shutil
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -24,14 +25,15 @@ from edge_depth_nerf.films.intensities import Intensities
 from edge_depth_nerf.films.scan_command import render_lidar
 from edge_depth_nerf.films.scan_film import SIZE_PX, draw_scan
 from edge_depth_nerf.films.scan_options import RenderLidarOptions
+from edge_depth_nerf.films.scanning import RayDrop
 from edge_depth_nerf.lidar.patterns import ScanPattern
 from edge_depth_nerf.lidar.roughness import roughness
 from edge_depth_nerf.lidar.scans import PointTimes, ScanFormat, read_scan
 from edge_depth_nerf.plugin import viewer
-from edge_depth_nerf.plugin.scanning import FOLIAGE, Caster, SceneToModel, evaluate_scans
+from edge_depth_nerf.plugin.scanning import FOLIAGE, Caster, HeldOutRays, SceneToModel, evaluate_scans
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.scene.reader import read_scene
+from edge_depth_nerf.scene.reader import SceneFolder, read_scene
 from edge_depth_nerf.scene.sweeps import SceneScanner, SceneSweep, SweepRays, scanners_of
 
 QUIET = Console(quiet=True)
@@ -219,10 +221,12 @@ def test_figures_say_how_far_a_model_is_off(trained, monkeypatch):
 def test_a_training_is_held_against_what_a_camera_could_see_of_held_out_sweeps(scanner):
     scene = read_scene(scanner.sweeps[0].path.parents[2])
     outputs = SimpleNamespace(dataparser_transform=torch.eye(4)[:3], dataparser_scale=0.1)
-    dataset = SimpleNamespace(_dataparser_outputs=outputs)
+    dataset = SimpleNamespace(_dataparser_outputs=outputs, scene=scene)
     model = RoomModel(SceneToModel.of(outputs, scene.meta), offset_m(scanner), off_m=0.9)
     pipeline = SimpleNamespace(model=model, datamanager=SimpleNamespace(train_dataset=dataset))
-    figures, kept = evaluate_scans(pipeline, scene)
+    rays_ = HeldOutRays.of(scene)
+    assert rays_ is not None
+    figures, kept = evaluate_scans(pipeline, rays_)
     parts, within = kept["scan_parts"], kept["scan_within"]
     asked = []
     for sweep in (each for each in scanner.sweeps if each.held_out):
@@ -262,6 +266,20 @@ def test_the_viewer_shows_a_held_out_sweep_as_the_model_renders_it(scanner, monk
     expected = place.points(rays.origin_m + rays.direction * (rays.distance_m[:, None] + 0.3))
     np.testing.assert_allclose(cloud.points, expected, atol=1e-3)
     np.testing.assert_allclose(np.asarray(cloud.sigma_m), 0.3, atol=5e-3)
+
+
+def test_rays_of_held_out_sweeps_alone_are_read_and_a_missing_file_is_named(scanner, tmp_path, monkeypatch):
+    folder = shutil.copytree(scanner.sweeps[0].path.parents[2], tmp_path / "scene")
+    scene, read = read_scene(folder), []
+    monkeypatch.setattr(SceneSweep, "read", lambda self, whole=SceneSweep.read: read.append(self) or whole(self))
+    rays = HeldOutRays.of(scene)
+    assert rays is not None and len(rays.distance_m) and read and all(sweep.held_out for sweep in read)
+    # a camera that is held out as a whole asks for nothing
+    monkeypatch.setattr(SceneFolder, "held_out_cameras", lambda self: {*self.cameras()})
+    assert HeldOutRays.of(scene) is None
+    read[0].path.unlink()
+    with pytest.raises(FileNotFoundError, match=read[0].path.name):
+        HeldOutRays.of(scene)
 
 
 def test_leaves_are_told_from_walls():
@@ -366,6 +384,15 @@ def test_a_film_shows_each_scan(trained):
     seen, expected = ((np.abs(each.astype(int) - NO_VALUE_RGB) > 25).any(2) for each in (shown, drawn))
     assert (seen & expected).sum() > 0.7 * expected.sum() > 0.7 * 1000
     assert (seen & expected[:, ::-1]).sum() < 0.4 * expected.sum()
+
+
+@pytest.mark.parametrize("form", ["ply", "bin"])
+def test_a_film_has_an_empty_picture_where_no_ray_came_back(trained, monkeypatch, form):
+    monkeypatch.setattr(RayDrop, "kept", lambda _, cast, reach_m: np.zeros(cast.hit.shape, bool))
+    output = render_lidar(RenderLidarOptions(trained, every=9, film=True, form=form), QUIET)
+    with Image.open(output / "scans.webp") as film:
+        assert np.abs(np.asarray(film.convert("RGB")).astype(int) - NO_VALUE_RGB).max() < 4
+    assert read_json(output / "figures.json")["sweeps"]["median_m"] < 2e-3
 
 
 def test_points_are_drawn_from_behind_and_above():

@@ -41,10 +41,9 @@ from edge_depth_nerf.jobs.runs import end_with_parent, steps_done
 from edge_depth_nerf.jobs.tasks import WORK
 from edge_depth_nerf.mono.calibration import maps_trained_on
 from edge_depth_nerf.plugin.evaluation import evaluated
-from edge_depth_nerf.plugin.scanning import evaluate_scans
+from edge_depth_nerf.plugin.scanning import HeldOutRays, evaluate_scans
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 from edge_depth_nerf.scene.format import LAYERS, read_transforms
-from edge_depth_nerf.scene.reader import read_scene
 
 CURVE = (0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """When the random pixels are evaluated, as shares of the training."""
@@ -193,6 +192,8 @@ def do_run(folder: Path) -> None:
     trainer.setup()
     dataset: Any = trainer.pipeline.datamanager.eval_dataset
     beside = shifted_views(Path(run.scene), dataset) if run.whole_views else {}
+    # a broken file of a sweep is named before the training
+    scan_rays = HeldOutRays.of(dataset.scene) if run.whole_views else None
     views = len(dataset) + sum(map(len, beside.values())) if run.whole_views else 0
     views *= 2 if run.detail else 1
     # nerfstudio prints each step; the bar wants the share of all the work
@@ -226,9 +227,10 @@ def do_run(folder: Path) -> None:
         evaluator = ViewEvaluator(trainer.pipeline, on_view)
         found, bins = evaluator.held_out(folder / VIEWS)
         figures |= found | evaluator.shifted(beside) | evaluate_beams(trainer.pipeline)
-        with evaluated(trainer.pipeline.model):
-            of_scans, parts = evaluate_scans(trainer.pipeline, read_scene(Path(run.scene)))
-        figures, bins = figures | of_scans, bins | parts
+        if scan_rays is not None:
+            with evaluated(trainer.pipeline.model):
+                of_scans, parts = evaluate_scans(trainer.pipeline, scan_rays)
+            figures, bins = figures | of_scans, bins | parts
         if run.detail:
             figures |= evaluator.with_detail(folder / VIEWS, beside)
     weight, sigma = setting_of(config, run.method)

@@ -209,8 +209,11 @@ def _film(output: Path, options: RenderLidarOptions, times_s: Float64[np.ndarray
     film = ScanFilm(float(np.median(np.diff(times_s[:: options.every]))) if len(times_s) > options.every else 0.1)
     with progress_bars(console, counted=True) as progress:
         for number in progress.track(range(0, len(times_s), options.every), description="Drawing the film"):
-            path = output / f"{number:010d}.{options.form}"
-            film.add(read_scan(path, ScanFormat()).points_m.numpy())
+            try:
+                points_m = read_scan(output / f"{number:010d}.{options.form}", ScanFormat()).points_m.numpy()
+            except InputError:  # no ray came back: a scan without points, which no drive has
+                points_m = np.zeros((0, 3), np.float32)
+            film.add(points_m)
     film.write(output / FILM)
     say(console, f"  {output / FILM}")
 
@@ -234,9 +237,9 @@ def _show(figures: dict[str, dict[str, float]], console: Console) -> None:
             f"are within 10 cm, {found['within_30_cm']:.1%} within 30 cm."
         )
         if "drop_f1" in found:
-            text += (
-                f" Rays that are lost: F1 {found['drop_f1']:.2f}. Chamfer distance: {100 * found['chamfer_m']:.1f} cm."
-            )
+            text += f" Rays that are lost: F1 {found['drop_f1']:.2f}."
+        if "chamfer_m" in found:
+            text += f" Chamfer distance: {100 * found['chamfer_m']:.1f} cm."
         if "intensity_error" in found:
             text += f" Intensities are off by {found['intensity_error']:.0%} of their usual difference from the median."
         say(console, text)

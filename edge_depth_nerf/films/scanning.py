@@ -184,8 +184,9 @@ def evaluate(
         recorded, rendered = map(np.concatenate, zip(*bright, strict=True))
         if usual := float(np.abs(recorded - np.median(recorded)).mean()):
             found["sweeps_in_pictures"]["intensity_error"] = float(np.abs(rendered - recorded).mean()) / usual
-    if more:
-        found["sweeps"] |= {key: float(np.mean([each[key] for each in more])) for key in more[0]}
+    for key in ("drop_f1", "chamfer_m"):
+        if of_scans := [each[key] for each in more if key in each]:
+            found["sweeps"][key] = float(np.mean(of_scans))
     return found
 
 
@@ -202,7 +203,6 @@ def _of_whole(
     lost, truly = ~kept, ~came_back(sweep, rays, pattern, scanner)
     both = (lost & truly).sum()
     points_m = (origins[None] + directions * cast.distance_m[..., None])[kept]
-    return {
-        "drop_f1": float(2 * both / max(1, lost.sum() + truly.sum())),
-        "chamfer_m": chamfer_m(points_m, rays.points_m) if len(points_m) else float("nan"),
-    }
+    figures = {"drop_f1": float(2 * both / max(1, lost.sum() + truly.sum()))}
+    # a scan without points is no distance away
+    return figures | {"chamfer_m": chamfer_m(points_m, rays.points_m)} if len(points_m) else figures

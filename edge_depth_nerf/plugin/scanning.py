@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -137,12 +137,15 @@ def errors(measured_m: Float[np.ndarray, "rays"], rendered_m: Float[np.ndarray, 
     }
 
 
-def held_out_sweeps(scanner: SceneScanner) -> Iterator[tuple[str, SceneSweep, SweepRays, Bool[np.ndarray, "rays"]]]:
+def held_out_sweeps(
+    scanner: SceneScanner, kinds: Sequence[str] = ("sweeps", "beams")
+) -> Iterator[tuple[str, SceneSweep, SweepRays, Bool[np.ndarray, "rays"]]]:
     """Give what no training saw of a scanner: "sweeps" that are held out, and held-out "beams" of the others.
 
     Of each kind at most `MOST_SWEEPS`, spread over the drive; each with its rays, and which of them count.
     """
-    for kind, held_out in (("sweeps", True), ("beams", False)):
+    for kind in kinds:
+        held_out = kind == "sweeps"
         sweeps = [sweep for sweep in scanner.sweeps if sweep.held_out == held_out]
         for sweep in (sweeps[place] for place in spread_over(len(sweeps), MOST_SWEEPS)):
             rays = sweep.read()
@@ -169,44 +172,63 @@ def points_within(
 
 
 def in_pictures(scene: SceneFolder, sweep: SceneSweep, rays: SweepRays) -> Bool[np.ndarray, "rays"]:
-    """Say which points of a sweep lie inside the mask of a picture of its frame, hidden there or not."""
-    found = np.zeros(len(rays.ring), bool)
+    """Say which points of a sweep lie inside the mask of a picture of its frame, hidden there or not.
+
+    Cameras that training saw nothing of do not count.
+    """
+    found, unseen = np.zeros(len(rays.ring), bool), scene.held_out_cameras()
     for picture in scene.pictures:
-        if sweep.frame is not None and picture.frame == sweep.frame:
+        if sweep.frame is not None and picture.frame == sweep.frame and picture.camera not in unseen:
             found[points_within(picture, scene.usable(picture), rays.points_m)] = True
     return found
 
 
-def evaluate_scans(pipeline: Any, scene: SceneFolder) -> tuple[dict[str, float], dict[str, list[dict[str, Any]]]]:
-    """Hold a trained pipeline against the rays of held-out sweeps that a camera could see, 1 to 60 m.
+@dataclass(frozen=True, eq=False)
+class HeldOutRays:
+    """The rays of a scene's held-out sweeps that end inside a picture of their frame, 1 to 60 m."""
+
+    origin_m: Float32[np.ndarray, "rays 3"]
+    """In the scene, as `direction`."""
+    direction: Float32[np.ndarray, "rays 3"]
+    distance_m: Float32[np.ndarray, "rays"]
+    elevation_deg: Float[np.ndarray, "rays"]
+    """Above the scanner's xy plane."""
+    roughness: Float64[np.ndarray, "rays"]
+
+    @classmethod
+    def of(cls, scene: SceneFolder) -> HeldOutRays | None:
+        """Read them; None if there are none.
+
+        Raises:
+            FileNotFoundError, InputError: the file of a sweep is missing or broken.
+        """
+        parts: list[tuple[NDArray, ...]] = []
+        for scanner in scanners_of(scene.meta, scene.path).values():
+            for _, sweep, rays, counts in held_out_sweeps(scanner, ["sweeps"]):
+                within = (rays.distance_m >= EVALUATED_RANGE_M[0]) & (rays.distance_m <= EVALUATED_RANGE_M[1])
+                chosen = some_of(counts & within & in_pictures(scene, sweep, rays))
+                along = rays.direction[chosen]
+                elevation_deg = np.rad2deg(np.arcsin(np.clip(along @ sweep.scanner_to_scene[:3, 2], -1, 1)))
+                rough = roughness(rays.distance_m, rays.ring, rays.offset_s)[chosen]
+                parts.append((rays.origin_m[chosen], along, rays.distance_m[chosen], elevation_deg, rough))
+        if not any(len(each[0]) for each in parts):
+            return None
+        return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def evaluate_scans(pipeline: Any, rays: HeldOutRays) -> tuple[dict[str, float], dict[str, list[dict[str, Any]]]]:
+    """Hold a trained pipeline against recorded rays.
 
     Returns:
         The figures of `errors`, as scan_median_m and so on, of foliage as scan_foliage_…; and, as scan_parts, the same
         in the parts of `PARTS`, each with by, low and high, and as scan_within the share of rays whose error is at
-        most error_m. Without such rays there is nothing.
+        most error_m.
     """
-    outputs = pipeline.datamanager.train_dataset._dataparser_outputs
-    caster = Caster(pipeline.model, SceneToModel.of(outputs, scene.meta))
-    measured: list[NDArray] = []
-    rendered: list[NDArray] = []
-    values: dict[str, list[NDArray]] = {"elevation_deg": [], "roughness": []}
-    for scanner in scanners_of(scene.meta, scene.path).values():
-        for kind, sweep, rays, counts in held_out_sweeps(scanner):
-            if kind != "sweeps":
-                continue
-            within = (rays.distance_m >= EVALUATED_RANGE_M[0]) & (rays.distance_m <= EVALUATED_RANGE_M[1])
-            chosen = some_of(counts & within & in_pictures(scene, sweep, rays))
-            if not len(chosen):
-                continue
-            measured.append(rays.distance_m[chosen])
-            rendered.append(caster.cast_at(rays, chosen))
-            upward = rays.direction[chosen] @ sweep.scanner_to_scene[:3, 2]
-            values["elevation_deg"].append(np.rad2deg(np.arcsin(np.clip(upward, -1, 1))))
-            values["roughness"].append(roughness(rays.distance_m, rays.ring, rays.offset_s)[chosen])
-    if not measured:
-        return {}, {}
-    true_m, found_m = np.concatenate(measured), np.concatenate(rendered)
-    by = {"distance_m": true_m, **{name: np.concatenate(each) for name, each in values.items()}}
+    dataset = pipeline.datamanager.train_dataset
+    caster = Caster(pipeline.model, SceneToModel.of(dataset._dataparser_outputs, dataset.scene.meta))
+    found_m = caster.cast(rays.origin_m.astype(np.float64), rays.direction.astype(np.float64)).distance_m
+    true_m = rays.distance_m
+    by = {"distance_m": true_m, "elevation_deg": rays.elevation_deg, "roughness": rays.roughness}
     parts: list[dict[str, Any]] = []
     for name, edges in PARTS.items():
         for low, high in itertools.pairwise(edges):
