@@ -25,13 +25,14 @@ help:
 PACKAGES_GB := 9.7
 TEMPORARY_GB := 3.6
 
-# OpenCV comes in several wheels that overwrite each other; the one with contrib and without a window goes last.
+# OpenCV comes in several wheels that overwrite each other; the one with contrib and without a window goes last. Bytecode
+# of all packages would take two minutes; Python makes that of what is imported.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) .ci/enough_space.py $(VENV) $(PACKAGES_GB) $(TEMPORARY_GB)
 	@echo "Installing into $(VENV): some minutes, 9 GB. pip prints nothing while it works, except warnings of other packages."
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt --no-deps --force-reinstall opencv-contrib-python-headless
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt --no-deps --force-reinstall opencv-contrib-python-headless
 	touch $@
 
 setup: $(VENV)/.installed

@@ -132,7 +132,8 @@ def render_tile(
         return colours, height_m
     start_m = path_m[near] + above_m
     origin_m = np.concatenate([place[near], start_m[:, None]], axis=1)
-    cast = caster.cast(origin_m, np.broadcast_to(DOWN, origin_m.shape), reach_m=above_m + BELOW_M)
+    down = np.broadcast_to(DOWN, origin_m.shape)
+    cast = caster.cast(origin_m, down, reach_m=above_m + BELOW_M, colours=True)
     assert cast.rgb is not None
     found = np.flatnonzero((cast.hit >= HIT) & (cast.distance_m >= LEAST_M))
     surface_m = origin_m[found] + DOWN * cast.distance_m[found, None]

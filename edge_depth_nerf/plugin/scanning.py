@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64
 from nerfstudio.cameras.rays import RayBundle
 from numpy.typing import NDArray
+from torch import Tensor
 
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.cameras.transforms import rigid
@@ -72,7 +73,7 @@ class Cast:
     hit: Float32[np.ndarray, "*rays"]
     """The share of the light that is stopped, 0 to 1."""
     rgb: Float32[np.ndarray, "*rays 3"] | None = None
-    """Colours, 0 to 1, where the model renders any."""
+    """Colours, 0 to 1, if they were asked for."""
 
 
 class Caster:
@@ -88,11 +89,12 @@ class Caster:
         origin_m: Float[np.ndarray, "*rays 3"],
         direction: Float[np.ndarray, "*rays 3"],
         reach_m: float | None = None,
+        colours: bool = False,
     ) -> Cast:
         """Cast rays from places in the scene (metres) along unit vectors in the scene.
 
         They begin at the model's near plane and end at its far plane; with `reach_m` they begin at their origins, end
-        after so many metres, and meet no sky.
+        after so many metres, and meet no sky. Colours take as long as the rest.
         """
         shape = direction.shape[:-1]
         flat = [each.reshape(1, -1, 3) for each in (origin_m, direction)]
@@ -106,10 +108,24 @@ class Caster:
         rays.metadata = {"directions_norm": one}
         if reach_m is not None:
             rays.nears, rays.fars = torch.zeros_like(one), one * reach_m * place.units_per_metre
-        outputs = self._model.get_outputs_for_camera_ray_bundle(rays)
+        outputs = self._model.get_outputs_for_camera_ray_bundle(rays) if colours else self._lengths(rays)
         depth, hit = (outputs[name].reshape(shape).float().cpu().numpy() for name in ("depth", "accumulation"))
-        rgb = outputs["rgb"].reshape(*shape, 3).float().cpu().numpy() if "rgb" in outputs else None
+        rgb = outputs["rgb"].reshape(*shape, 3).float().cpu().numpy() if colours else None
         return Cast(depth / np.float32(place.units_per_metre), hit, rgb)
+
+    def _lengths(self, rays: RayBundle) -> dict[str, Tensor]:
+        """The model's depth and accumulation, without its colours."""
+        model, most = self._model, self._model.config.eval_num_rays_per_chunk
+        found: list[tuple[Tensor, Tensor]] = []
+        for first in range(0, len(rays), most):
+            part = rays.get_row_major_sliced_ray_bundle(first, first + most)
+            bounded = part if model.collider is None else model.collider(part)
+            samples, _, _ = model.proposal_sampler(bounded, density_fns=model.density_fns)
+            weights = samples.get_weights(model.field.get_density(samples)[0])
+            depth = model.renderer_depth(weights=weights, ray_samples=samples)
+            found.append((depth, model.renderer_accumulation(weights=weights)))
+        depth, hit = (torch.cat(each) for each in zip(*found, strict=True))
+        return {"depth": depth, "accumulation": hit}
 
     def cast_at(self, rays: SweepRays, chosen: NDArray[np.intp]) -> Float32[np.ndarray, "chosen"]:
         """Give the rendered distance along some rays of a sweep, metres."""

@@ -391,7 +391,7 @@ class DriveLayers(ViewerControl):
         chosen = some_of(np.ones(len(rays.ring), bool))
         origin_m, along = (each[chosen].astype(np.float64) for each in (rays.origin_m, rays.direction))
         with self.viewer.train_lock or nullcontext(), evaluated(model):
-            cast = Caster(model, place).cast(origin_m, along)
+            cast = Caster(model, place).cast(origin_m, along, colours=True)
         points_m = origin_m + along * cast.distance_m[:, None]
         error_m = np.abs(cast.distance_m - rays.distance_m[chosen])
         rgb = np.zeros((len(chosen), 3)) if cast.rgb is None else cast.rgb.clip(0, 1)
