@@ -70,13 +70,25 @@ def write_drive(folder: Path, extra_m: dict[int, np.ndarray] | None = None, top_
     return read_scene(folder)
 
 
+@pytest.fixture(scope="module")
+def towards(tmp_path_factory) -> SceneFolder:
+    """The drive with nothing extra; it is only read."""
+    return write_drive(tmp_path_factory.mktemp("towards"))
+
+
+@pytest.fixture(scope="module")
+def low(tmp_path_factory) -> SceneFolder:
+    """The field ends at the horizon: from far away even the ground lies hardly below it."""
+    return write_drive(tmp_path_factory.mktemp("low"), top_deg=0.0)
+
+
 def shown(scene: SceneFolder, index: int) -> np.ndarray:
     cloud = static_cloud(scene, scene.pictures)
     return seen_above(cloud, scene, scene.pictures[index], (LENS.width, LENS.height))
 
 
-def test_a_wall_is_known_as_high_as_it_was_seen_from_afar(tmp_path):
-    found = shown(write_drive(tmp_path), 5)
+def test_a_wall_is_known_as_high_as_it_was_seen_from_afar(towards):
+    found = shown(towards, 5)
     # from the start, 20 m away, LiDAR reaches 1.5 m + 20 m · tan 2° = 2.2 m; from 6 m away that is 6.6° up
     ahead = (np.abs(rays()[..., 0]) < 0.1) & (rays()[..., 1] > 0)
     newly = ahead & (elevation_deg() > FIELD_DEG + 0.5) & (elevation_deg() < 5.5)
@@ -88,8 +100,10 @@ def test_a_wall_is_known_as_high_as_it_was_seen_from_afar(tmp_path):
     assert not found[elevation_deg() < FIELD_DEG - 1].any()
 
 
-def test_the_first_picture_learns_nothing_from_nearer_ones(tmp_path):
-    assert (shown(write_drive(tmp_path), 0) > 0).mean() < 0.005
+@pytest.mark.parametrize("pictures", [0, 1, None])
+def test_the_first_picture_learns_nothing_from_nearer_ones(towards, pictures):
+    cloud = static_cloud(towards, towards.pictures[:pictures])
+    assert (seen_above(cloud, towards, towards.pictures[0], (LENS.width, LENS.height)) > 0).mean() < 0.005
 
 
 def test_what_stands_before_the_picture_hides_the_wall_above_it_as_well(tmp_path):
@@ -113,25 +127,16 @@ def test_what_other_pictures_see_through_has_moved(tmp_path, monkeypatch):
     assert (lorry := shown(scene, 4))[lorry > 0].min() < 5.5
 
 
-def test_own_points_come_first_in_examples(tmp_path):
-    scene = write_drive(tmp_path)
+def test_own_points_come_first_in_examples(towards):
     heights = [{"front": EYE_M}]
-    alone = load_examples([scene], [scene.pictures[:2]], heights, 60, 4)
+    alone = load_examples([towards], [towards.pictures[:2]], heights, 60, 4)
     seven = [lambda picture, size: np.full(size[::-1], 7.0, "f4")]
-    both = load_examples([scene], [scene.pictures[:2]], heights, 60, 4, far_seen=seven)
+    both = load_examples([towards], [towards.pictures[:2]], heights, 60, 4, far_seen=seven)
     has = alone.lidar_m > 0
     assert 0.1 < has.mean() < 0.9
     np.testing.assert_array_equal(both.lidar_m[has], alone.lidar_m[has])
     assert (both.lidar_m[~has & both.usable] == 7.0).all()
     assert not both.lidar_m[~both.usable].any()
-
-
-@pytest.mark.parametrize("pictures", [0, 1])
-def test_one_picture_or_none_knows_nothing_more(tmp_path, pictures):
-    scene = write_drive(tmp_path)
-    cloud = static_cloud(scene, scene.pictures[:pictures])
-    found = seen_above(cloud, scene, scene.pictures[0], (LENS.width, LENS.height))
-    assert (found > 0).mean() < 0.005
 
 
 # ---- long drives -----------------------------------------------------------------------------------------------
@@ -148,22 +153,19 @@ def rows(points_m: np.ndarray) -> np.ndarray:
     return points_m[np.lexsort(points_m.T)]
 
 
-def test_a_drive_far_away_changes_nothing(tmp_path):
-    # the field ends at the horizon: from far away even the ground lies hardly below it
-    scene = write_drive(tmp_path, top_deg=0.0)
-    alone, both = static_cloud(scene, scene.pictures), static_cloud(scene, copies(scene, 2))
+def test_a_drive_far_away_changes_nothing(low):
+    alone, both = static_cloud(low, low.pictures), static_cloud(low, copies(low, 2))
     here = both.points_m[:, 0] < 150
     assert len(alone.points_m) > 50
     np.testing.assert_array_equal(rows(both.points_m[here]), rows(alone.points_m))
     assert len(alone.spacing_m) == here.sum() == (~here).sum()
     size = (LENS.width, LENS.height)
-    for picture in scene.pictures:
-        of_both, of_one = (seen_above(cloud, scene, picture, size) for cloud in (both, alone))
+    for picture in low.pictures:
+        of_both, of_one = (seen_above(cloud, low, picture, size) for cloud in (both, alone))
         np.testing.assert_array_equal(of_both, of_one, strict=True)
 
 
-def test_the_work_grows_with_the_length_of_the_drive(tmp_path, monkeypatch):
-    scene = write_drive(tmp_path, top_deg=0.0)
+def test_the_work_grows_with_the_length_of_the_drive(low, monkeypatch):
     looked_at = {"_is_above": 0, "_votes": 0, "first_in_voxel": 0}
 
     def counted(name: str, points_at: int):
@@ -182,14 +184,14 @@ def test_the_work_grows_with_the_length_of_the_drive(tmp_path, monkeypatch):
     costs = []
     for count in (2, 8):
         looked_at.update(dict.fromkeys(looked_at, 0))
-        cloud = static_cloud(scene, copies(scene, count))
-        seen_above(cloud, scene, scene.pictures[0], (60, 50))
+        cloud = static_cloud(low, copies(low, count))
+        seen_above(cloud, low, low.pictures[0], (60, 50))
         costs.append(dict(looked_at))
     assert all(costs[0].values())
     for name in ("_is_above", "_votes"):
         assert costs[1][name] < 4.4 * costs[0][name], (name, costs)
     # what is thinned again each time is at most as much as what came since
-    measured = sum(int((far_seen._own(scene, picture)[1] > 0).sum()) for picture in scene.pictures)
+    measured = sum(int((far_seen._own(low, picture)[1] > 0).sum()) for picture in low.pictures)
     assert 8 * measured <= costs[1]["first_in_voxel"] < 2.5 * 8 * measured, (measured, costs)
 
 
@@ -205,9 +207,8 @@ def test_near_points_are_those_within_reach(monkeypatch):
         np.testing.assert_array_equal(rows(cloud.points_m[cloud.near(picture)]), rows(points[expected]))
 
 
-@pytest.mark.parametrize("top_deg", [2.0, -3.0])
-def test_the_field_is_where_the_points_are(tmp_path, top_deg):
-    scene = write_drive(tmp_path, top_deg=top_deg)
+def test_the_field_is_where_the_points_are(tmp_path):
+    scene = write_drive(tmp_path, top_deg=-3.0)
     up = [elevation_deg()[far_seen._own(scene, picture)[1] > 0] for picture in scene.pictures]
     expected = np.quantile(np.concatenate(up), [0.001, 0.999])
     assert field_deg(scene, scene.pictures) == pytest.approx(expected, abs=0.05)

@@ -188,7 +188,7 @@ def seen_in_the_ball(picture: ScenePicture, in_camera: np.ndarray) -> np.ndarray
 @pytest.mark.parametrize("kind", ["relative", "inverse"])
 def test_frames_with_few_points_take_the_drives_fit(tmp_path, kind):
     """Scales differ from view to view, but not from frame to frame, except in the held-out one."""
-    folder = write_scene(tmp_path, [scaled_lens(FISHEYE, (90, 90))], mono=False)
+    folder = write_scene(tmp_path, [scaled_lens(FISHEYE, (90, 90))], frames=5, mono=False)
     few = "images/0002.png"
     lidar = read_distance_png(folder / "lidar/0002.png")
     lidar[lidar > 0] *= np.random.default_rng(0).random((lidar > 0).sum()) < 0.005
@@ -323,7 +323,7 @@ def test_a_network_is_shown_its_own_preparation_of_the_picture(networks):
 
 @pytest.mark.parametrize("name", ["anything-metric", "dpt"])
 def test_the_command_writes_maps_of_a_ready_made_network(networks, name, tmp_path, monkeypatch, capsys):
-    folder = write_scene(tmp_path / "scene", [fisheye(48, 44)], mono=False)
+    folder = write_scene(tmp_path / "scene", [fisheye(48, 44)], frames=4, mono=False)
     before = read_json(folder / "transforms.json")
     command = ["edge-depth-nerf", "estimate-depth", str(folder), "--hf", str(networks / name)]
     monkeypatch.setattr(sys, "argv", command)
