@@ -64,13 +64,10 @@ MISSING = {PICTURE: {("image_03", 5)}, SWEEP: {("image_02", 7), ("image_03", 7)}
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [
-        (PICTURE, halve, r"0000000005\.png: truncated"),
         (PICTURE, damage, r"0000000005\.png: (damaged|cannot be decoded)"),
-        (PICTURE, b"", "not a PNG"),
         (SWEEP, cut, r"0000000007\.bin: .* bytes, expected a multiple of 16"),
         (SWEEP, lambda path: write_points(path, np.full((50, 3), np.nan)), "7.bin: none of its 50 points can be used"),
         (MONO, None, r"0000000006\.png: no such file"),
-        (MONO, damage, r"0000000006\.png: (damaged|cannot be decoded)"),
         (MONO, lambda path: write_distance_png(path, np.zeros((32, 32))), "contains no distance"),
     ],
 )
@@ -112,7 +109,7 @@ def test_a_mended_file_may_have_an_older_date(drive: RoomDrive) -> None:
     assert not run(drive)[0].left_out
 
 
-@pytest.mark.parametrize(("file", "change"), [(PICTURE, damage), (PICTURE, cut), (SWEEP, cut)])
+@pytest.mark.parametrize(("file", "change"), [(PICTURE, damage), (SWEEP, cut)])
 def test_a_file_that_is_mended_comes_into_the_scene(drive: RoomDrive, file: str, change: Change) -> None:
     path = drive.root.parent / file
     whole = path.read_bytes()
@@ -149,9 +146,8 @@ def test_a_fault_of_the_whole_drive_is_an_error(drive: RoomDrive) -> None:
         InputError, match=r"0000000003\.png: .*3 of this drive's files cannot be used; at most 2 may be left out"
     ):
         run(drive, "more")
-    halve(drive.image("image_03", 3))
-    halve(drive.image("image_03", 6))
-    halve(drive.image("image_03", 8))
+    for frame in (3, 6, 8):
+        halve(drive.image("image_03", frame))
     with pytest.raises(InputError, match="at most 2 may be left out"):
         run(drive, "many")
     assert not (drive.root.parent / "many").exists()

@@ -310,15 +310,10 @@ def test_the_same_seed_gives_the_same_weights_and_another_one_others(small_stree
     examples = examples_of(small_street)
     runs = [train(examples, None, TINY, TrainingOptions(steps=4, seed=seed)).network for seed in (3, 3, 4)]
     assert same(runs[0], runs[1]) and not same(runs[0], runs[2])
-
-
-def test_it_gives_the_same_weights_on_one_thread_and_on_two(small_street):
-    examples, networks = examples_of(small_street), []
-    for threads in (1, 2):
-        with torch_threads(threads):
-            networks.append(train(examples, None, TINY, TrainingOptions(steps=4)).network)
-            assert torch.get_num_threads() == threads
-    assert same(*networks)
+    assert torch.get_num_threads() == 1
+    with torch_threads(2):
+        assert same(train(examples, None, TINY, TrainingOptions(steps=4, seed=3)).network, runs[0])
+        assert torch.get_num_threads() == 2
 
 
 def test_the_loss_of_a_batch_is_the_sum_of_its_parts(small_street):
@@ -421,18 +416,18 @@ def test_held_out_pictures_have_no_say_and_the_command_continues(small_street, t
     held_out = "0004.png"
     write_png(other / "images" / held_out, np.full((LENS.height, LENS.width, 3), 200, np.uint8))
     write_distance_png(other / "lidar" / held_out, np.full((LENS.height, LENS.width), 33.0))
-    reports = [estimate_depth(EstimateDepthOptions((scene,), train_steps=6), QUIET) for scene in (small_street, other)]
+    reports = [estimate_depth(EstimateDepthOptions((scene,), train_steps=3), QUIET) for scene in (small_street, other)]
     weights = [load_file(report.weights) for report in reports]
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
-    assert reports[0].trained is not None and reports[0].trained.steps == 6 and reports[0].predicted == 10
+    assert reports[0].trained is not None and reports[0].trained.steps == 3 and reports[0].predicted == 10
     assert not list(small_street.glob("*.checkpoint"))
     entry = read_json(small_street / "transforms.json")["mono"]
     # frame 4 is held out, frame 5 kept for stopping
     assert entry["trained_frames"] == [f"images/{number:04d}.png" for number in (0, 1, 2, 3, 6, 7, 8, 9)]
 
     # what is trained is not trained again, until something is asked for differently
-    assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=6), QUIET).trained is None
-    assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=7), QUIET).trained is not None
+    assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=3), QUIET).trained is None
+    assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=4), QUIET).trained is not None
 
 
 def test_a_network_whose_time_was_up_early_is_told_of(small_street, capsys):
@@ -506,14 +501,10 @@ def said_by(options: EstimateDepthOptions) -> str:
 
 
 @pytest.mark.usefixtures("tiny_preset")
-@pytest.mark.parametrize("content", ["broken", "older", "header"])
-def test_weights_in_the_scene_that_are_of_no_use_are_made_anew(small_street, content):
+@pytest.mark.parametrize("architecture", ["edge-depth-nerf/u-net-0", ARCHITECTURE])
+def test_weights_in_the_scene_that_are_of_no_use_are_made_anew(small_street, architecture):
     path = small_street / WEIGHTS
-    if content == "broken":
-        path.write_bytes(b"\x00" * 100)
-    else:
-        architecture = "edge-depth-nerf/u-net-0" if content == "older" else ARCHITECTURE
-        save_file({"a": torch.zeros(2)}, path, {"architecture": architecture, "header": "[]"})
+    save_file({"a": torch.zeros(2)}, path, {"architecture": architecture, "header": "[]"})
     said = said_by(EstimateDepthOptions((small_street,), train_steps=1))
     assert said.count("training starts again") == 1 and str(path) in said
     assert load_network(path)[1]["steps"] == 1
@@ -563,7 +554,7 @@ def test_pictures_kept_for_stopping_without_points(small_street):
 def test_scenes_of_one_name_keep_their_own_trained_frames(tmp_path):
     one = write_street(tmp_path / "a" / "scene", frames=10, seed=1)
     other = write_street(tmp_path / "b" / "scene", frames=4, seed=2)
-    unseen = write_street(tmp_path / "c" / "scene", frames=10, seed=3)
+    unseen = write_street(tmp_path / "c" / "scene", frames=3, seed=3)
     report = estimate_depth(EstimateDepthOptions((one, other), train_steps=1), QUIET)
     moved = other.rename(tmp_path / "elsewhere")
     estimate_depth(EstimateDepthOptions((unseen, moved), model=report.weights), QUIET)

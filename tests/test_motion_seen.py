@@ -161,6 +161,13 @@ def beyond_frames(mono_error: float, count: int = 12, seed: int = 0):
     return frames, maps, view, beyond
 
 
+@pytest.fixture(scope="module")
+def three_percent():
+    """Frames whose network is wrong by 3 % beyond the field, and what they give."""
+    frames, maps, view, where = beyond_frames(0.03)
+    return combine(frames, PriorOptions(), "key", False, motion_errors=MotionErrors(0.01, 0.02)), maps, view, where
+
+
 def covered(calibration, maps, view, where) -> tuple[float, float]:
     """Shares within one and two sigma of pixels beyond the field, of what motion says nothing of or of the rest."""
     scaled = []
@@ -178,7 +185,7 @@ def covered(calibration, maps, view, where) -> tuple[float, float]:
 def test_sigma_of_the_network_beyond_the_field_is_its_own():
     frames, _, _, _ = beyond_frames(0.06)
     calibration = combine(frames, PriorOptions(), "key", False, motion_errors=MotionErrors(0.01, 0.02))
-    _, maps, view, beyond = beyond_frames(0.06, seed=1)
+    _, maps, view, beyond = beyond_frames(0.06, count=6, seed=1)
     one, two = covered(calibration, maps, view, beyond)
     assert one == pytest.approx(0.68, abs=0.12) and two == pytest.approx(0.95, abs=0.05)
     # that of the field, where the network is right to 2 %, is too small, and it shows
@@ -189,9 +196,8 @@ def test_sigma_of_the_network_beyond_the_field_is_its_own():
     assert one < 0.5 and two < 0.8
 
 
-def test_without_a_measurement_beyond_there_is_no_prior():
-    frames, maps, view, beyond = beyond_frames(0.03)
-    whole = combine(frames, PriorOptions(), "key", False, motion_errors=MotionErrors(0.01, 0.02))
+def test_without_a_measurement_beyond_there_is_no_prior(three_percent):
+    whole, maps, view, beyond = three_percent
     motion = whole.motion
     assert motion is not None and motion.beyond is not None
     beyond_field = motion.beyond
@@ -218,13 +224,12 @@ def test_without_a_measurement_beyond_there_is_no_prior():
     )
 
 
-def test_beyond_the_field_a_monocular_distance_counts_only_where_neighbours_confirm_it():
-    frames, maps, view, beyond = beyond_frames(0.03)
-    calibration = combine(frames, PriorOptions(), "key", False, motion_errors=MotionErrors(0.01, 0.02))
+def test_beyond_the_field_a_monocular_distance_counts_only_where_neighbours_confirm_it(three_percent):
+    calibration, maps, view, beyond = three_percent
     rng = np.random.default_rng(2)
     usable = np.ones(SIZE, bool)
-    assert len(maps) >= 4
-    for truth, of_source in maps[:4]:
+    assert len(maps) >= 2
+    for truth, of_source in maps[:2]:
         # a beam before the ceiling, which no picture has matched; something of half the distance; and a few points
         shown = np.kron(rng.choice([0.0, 0.5, 1.0], (8, 12)), np.ones((10, 10)))
         around = truth * np.where(shown == 1, rng.random(SIZE) < 0.3, shown).astype(np.float32)

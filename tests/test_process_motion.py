@@ -1,6 +1,7 @@
 """Distances from motion for scenes: written whole, continued, made of training pictures alone."""
 
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -72,8 +73,18 @@ def motion_maps(scene: Path) -> list[np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    scene = write_ball_scene(tmp_path_factory.mktemp("ball"))
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_ball_scene(tmp_path_factory.mktemp("written"))
+
+
+@pytest.fixture
+def scene(written: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(written, tmp_path / "scene"))
+
+
+@pytest.fixture(scope="module")
+def ball(written: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    scene = Path(shutil.copytree(written, tmp_path_factory.mktemp("ball") / "scene"))
     assert "Motion gives distances for" in add(scene)
     return scene
 
@@ -107,17 +118,13 @@ def test_training_pictures_get_right_maps_and_held_out_ones_none(ball: Path) -> 
     assert not (ball / ".cache" / "motion").exists()
 
 
-def test_held_out_pictures_take_no_part(ball: Path, tmp_path: Path) -> None:
-    scene = write_ball_scene(tmp_path)
+def test_held_out_pictures_take_no_part(ball: Path, scene: Path) -> None:
     write_png(scene / "images" / f"{HELD_OUT:04d}.png", np.zeros((FISHEYE.height, FISHEYE.width, 3), np.uint8))
     add(scene)
     np.testing.assert_array_equal(motion_maps(scene), motion_maps(ball))
 
 
-def test_a_run_that_was_stopped_goes_on_where_it_was(
-    ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene = write_ball_scene(tmp_path)
+def test_a_run_that_was_stopped_goes_on_where_it_was(ball: Path, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sweep, swept = Motion.sweep, []
 
     def stopped(self: Motion, index: int) -> Any:
@@ -143,9 +150,23 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(
     np.testing.assert_array_equal(motion_maps(scene), motion_maps(ball))
 
 
-def test_each_picture_is_confirmed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two layers are made of it, and a run that was stopped while it wrote them does not confirm anew."""
-    scene = write_ball_scene(tmp_path)
+def stopped_after_its_sweeps(scene: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the sweeps of a run that was stopped before it confirmed any."""
+    with monkeypatch.context() as patch:
+        patch.setattr(Motion, "confirm", lambda *_: pytest.fail("stopped"))
+        with pytest.raises(pytest.fail.Exception):
+            add(scene)
+    (made,) = (scene / ".cache" / "motion").iterdir()
+    return made
+
+
+def test_a_damaged_sweep_is_made_anew(ball: Path, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And each picture is confirmed once: two layers are made of it, also by a run that was stopped in between."""
+    made = stopped_after_its_sweeps(scene, monkeypatch)
+    whole = (made / "000001.npz").read_bytes()
+    (made / "000001.npz").write_bytes(whole[:-100])
+    sweep, swept = Motion.sweep, []
+    monkeypatch.setattr(Motion, "sweep", lambda self, index: swept.append(index) or sweep(self, index))
     confirm, confirmed = Motion.confirm, []
 
     def counted(self: Motion, index: int, sweeps: Any) -> MotionDistance:
@@ -161,33 +182,11 @@ def test_each_picture_is_confirmed_once(tmp_path: Path, monkeypatch: pytest.Monk
         with pytest.raises(KeyboardInterrupt):
             add(scene)
     add(scene)
-    assert sorted(confirmed) == [0, 1, 2, 3, 4]
-
-
-def stopped_after_its_sweeps(scene: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of the sweeps of a run that was stopped before it confirmed any."""
-    with monkeypatch.context() as patch:
-        patch.setattr(Motion, "confirm", lambda *_: pytest.fail("stopped"))
-        with pytest.raises(pytest.fail.Exception):
-            add(scene)
-    (made,) = (scene / ".cache" / "motion").iterdir()
-    return made
-
-
-def test_a_damaged_sweep_is_made_anew(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = write_ball_scene(tmp_path)
-    made = stopped_after_its_sweeps(scene, monkeypatch)
-    whole = (made / "000001.npz").read_bytes()
-    (made / "000001.npz").write_bytes(whole[:-100])
-    sweep, swept = Motion.sweep, []
-    monkeypatch.setattr(Motion, "sweep", lambda self, index: swept.append(index) or sweep(self, index))
-    add(scene)
-    assert swept == [1]
+    assert swept == [1] and sorted(confirmed) == [0, 1, 2, 3, 4]
     np.testing.assert_array_equal(motion_maps(scene), motion_maps(ball))
 
 
-def test_sweeps_of_other_pictures_are_not_taken(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = write_ball_scene(tmp_path)
+def test_sweeps_of_other_pictures_are_not_taken(ball: Path, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = stopped_after_its_sweeps(scene, monkeypatch)
     assert len(list(made.iterdir())) == len(STEPS_M) - 1
     (scene / "images" / "0001.png").write_bytes((scene / "images" / "0000.png").read_bytes())
