@@ -1,9 +1,14 @@
-"""Recordings that are whole and wrong: what fits is named, with the right amount; good ones give no warning."""
+"""Recordings that are whole and wrong: what fits is named, with the right amount; good ones give no warning.
+
+Then what `process` says of bad drives: broken JPEGs, inverted transforms, a vehicle that few pictures show, drives
+without LiDAR, pictures of any exposure.
+"""
 
 from __future__ import annotations
 
 import ast
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,14 +17,23 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from edge_depth_nerf.base.files import read_distance_png, read_mask, write_mask
+from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask, write_mask, write_png
+from edge_depth_nerf.cameras.transforms import rigid
+from edge_depth_nerf.inspecting.findings import find
 from edge_depth_nerf.lidar import Sweep
 from edge_depth_nerf.lidar.scans import columns_told
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.masks.lens import lens_circle
-from edge_depth_nerf.process import lidar_checks
+from edge_depth_nerf.process import build, lidar_checks
+from edge_depth_nerf.process.build import _never_held_out
+from edge_depth_nerf.process.colmap.scale import _scan
+from edge_depth_nerf.process.converters import convert
+from edge_depth_nerf.process.feature_masks import FeatureMasks
+from edge_depth_nerf.process.found_path import upright
 from edge_depth_nerf.process.lidar_checks import LidarCheck, check_lidar
 from edge_depth_nerf.process.mask_checks import mask_warnings
 from edge_depth_nerf.process.options import RigOptions
@@ -27,6 +41,9 @@ from edge_depth_nerf.process.path_checks import path_warnings
 from edge_depth_nerf.process.readings import Reading, _axes
 from edge_depth_nerf.process.recording import DepthFile, Recording
 from edge_depth_nerf.process.rig import read_rig_recording
+from edge_depth_nerf.process.vehicle import find_vehicle
+from edge_depth_nerf.scene.reader import read_scene
+from edge_depth_nerf.scene.writer import ProcessReport
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
@@ -95,17 +112,11 @@ def beside(metres: float) -> Change:
     return with_sweeps(lambda sweep: replace(sweep, points_m=sweep.points_m + torch.tensor([0.0, metres, 0.0])))
 
 
-def turned(degrees: float) -> Change:
-    return moved(Rotation.from_euler("z", degrees, degrees=True).as_matrix())
+def about_z(degrees: float) -> np.ndarray:
+    return Rotation.from_euler("z", degrees, degrees=True).as_matrix()
 
 
-def rigid_turn(degrees: float) -> np.ndarray:
-    found = np.eye(4)
-    found[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-    return found
-
-
-turned_5 = turned(5)
+turned_5 = moved(about_z(5))
 
 
 def pictures_later(seconds: float) -> Change:
@@ -114,21 +125,11 @@ def pictures_later(seconds: float) -> Change:
     )
 
 
-def inverted(recording: Recording) -> Recording:
-    cameras = [replace(one, to_vehicle=np.linalg.inv(one.to_vehicle)) for one in recording.cameras]
-    return replace(recording, cameras=tuple(cameras))
-
-
-def scanner_inverted(recording: Recording) -> Recording:
-    sweeps = [replace(one, to_vehicle=np.linalg.inv(one.to_vehicle)) for one in recording.sweeps]
-    return replace(recording, sweeps=tuple(sweeps))
-
-
 # ---- LiDAR -------------------------------------------------------------------------------------------------------
 def test_a_good_drive_gives_no_warning(whole: Recording) -> None:
-    found = checked(shorter(whole, range(2, 6)))
+    found = checked(shorter(only(whole, "left", "front"), range(2, 5)))
     assert found.warnings == ()
-    assert [one.camera for one in found.figures] == ["left", "right", "front"]
+    assert [one.camera for one in found.figures] == ["left", "front"]
     for one in found.figures:
         assert one.correlation > 0.9 and one.edge is not None and one.edge > 1
         assert one.apart_m is not None and one.apart_m < 0.05
@@ -138,23 +139,20 @@ def test_a_good_drive_gives_no_warning(whole: Recording) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (turned(90), "roof is turned by -90° about its z axis"),
         (moved(np.diag([1.0, -1, 1])), r"roof is given in other axes, where \(x, -y, z\) is x, y, z"),
         (moved(np.eye(3) * 3.28084), r"the points of roof in feet\? metres_per_unit = 0.3048"),
-        (beside(0.6), r"roof sits -0\.[4-7]\d m further along its y axis"),
-        (inverted, "to_vehicle of right is inverted"),
-        (scanner_inverted, "to_vehicle of roof is inverted"),
     ],
 )
 def test_what_is_wrong_is_named(brief: Recording, change: Change, said: str) -> None:
+    """A camera whose `to_vehicle` is inverted comes below, with `process`."""
     (warning,) = checked(change(brief)).warnings
     assert re.search(said, warning), warning
 
 
-def test_half_a_turn_is_named() -> None:
-    assert [said for axes, said in _axes() if np.array_equal(np.diag(axes), [-1, -1, 1, 1])] == [
-        "turned by 180° about its z axis"
-    ]
+def test_turns_are_named() -> None:
+    for degrees in (90, -90, 180):
+        said = [said for axes, said in _axes() if np.allclose(axes[:3, :3], about_z(degrees))]
+        assert said == [f"turned by {degrees}° about its z axis"]
 
 
 @pytest.mark.parametrize(
@@ -172,16 +170,12 @@ def test_small_faults_are_named_with_their_amount(recording: Recording, change: 
     assert re.search(said, warning), warning
     if change is turned_5:
         rows = np.array(ast.literal_eval(re.search(r"to_vehicle = (\[.*\])\)", warning)[1]))  # pyright: ignore
-        assert np.allclose(rows, recording.sweeps[0].to_vehicle @ rigid_turn(-5), atol=0.01)
+        assert np.allclose(rows, recording.sweeps[0].to_vehicle @ rigid(about_z(-5)), atol=0.01)
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
-    [
-        (None, None),
-        (pictures_later(0.3), r"the clock of (roof .* add 0\.(29|3[0-2])|right .* add -0\.(29|3[0-2])) to its"),
-        (beside(0.6), r"roof sits -0\.[4-7]\d m further along its y axis|right sits -0\.[4-7]\d m"),
-    ],
+    [(None, None), (beside(0.6), r"roof sits -0\.[4-7]\d m further along its y axis|right sits -0\.[4-7]\d m")],
 )
 def test_noisy_pictures_name_small_faults(
     recording: Recording, brief: Recording, monkeypatch: pytest.MonkeyPatch, change: Change | None, said: str | None
@@ -315,6 +309,10 @@ def degrees(places: np.ndarray) -> np.ndarray:
     return places / [73e3, 111e3, 1] + [8.4, 49, 0]
 
 
+def jump(places: np.ndarray) -> np.ndarray:
+    return places + 20 * (np.arange(len(places)) > len(places) // 2)[:, None]
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -322,6 +320,7 @@ def degrees(places: np.ndarray) -> np.ndarray:
         (placed(lambda places: places * 1000), "in millimetres: metres_per_unit = 0.001"),
         (placed(degrees), "degrees of longitude and latitude"),
         (placed(lambda places: places * 0), "never moves"),
+        (placed(jump), "The given path breaks between"),
         (w_first, "the poses' quaternions begin with w"),
     ],
 )
@@ -334,21 +333,10 @@ def test_poses_no_vehicle_has_are_named(
 
 
 def test_poses_of_a_sensor_are_named(recording: Recording) -> None:
+    """And a mounting in millimetres."""
     (camera,) = recording.cameras
     (warning,) = of_path(with_path(recording, lambda poses: poses @ camera.to_vehicle))
     assert "on its side" in warning and 'the poses are those of right: poses.of = "right"' in warning
-
-
-def test_a_path_with_a_jump_is_named(recording: Recording) -> None:
-    def jump(places: np.ndarray) -> np.ndarray:
-        return places + 20 * (np.arange(len(places)) > len(places) // 2)[:, None]
-
-    (warning,) = of_path(with_path(recording, placed(jump)))
-    assert "The given path breaks between" in warning
-
-
-def test_a_mounting_in_millimetres_is_named(recording: Recording) -> None:
-    (camera,) = recording.cameras
     to_vehicle = camera.to_vehicle.copy()
     to_vehicle[:3, 3] *= 1000
     (warning,) = of_path(replace(recording, cameras=(replace(camera, to_vehicle=to_vehicle),)))
@@ -372,3 +360,172 @@ def test_given_masks_are_held_against_the_pictures(whole: Recording, tmp_path: P
     assert "Is it inverted?" in said(~keep)
     keep[: int(0.7 * len(keep))] = False
     assert "of the lens" in said(keep)
+
+
+# ==== what `process` says of them =================================================================================
+@pytest.fixture
+def mine(drive: Path, tmp_path: Path) -> Path:
+    """A copy without what only rendered drives have."""
+    root = Path(shutil.copytree(drive, tmp_path / "drive", ignore=shutil.ignore_patterns("truth", "mono")))
+    edit(root, lambda text: re.sub(r"(?m)^(truth_|mono).*\n", "", text))
+    return root
+
+
+def edit(root: Path, change: Callable[[str], str]) -> None:
+    (root / "rig.toml").write_text(change((root / "rig.toml").read_text()))
+
+
+def run(root: Path, **changes) -> tuple[ProcessReport, str]:
+    given = {"root": root, "output": root.parent / "scene", "frames": 7, "sweeps": 1, "holdout_every": 4}
+    given |= {"refine_poses": False}
+    console = Console(width=10_000, force_terminal=False)
+    with console.capture() as said:
+        report = convert(RigOptions(**{**given, **changes}), console)
+    return report, said.get()
+
+
+# ---- broken pictures ---------------------------------------------------------------------------------------------
+def test_a_cut_jpeg_is_left_out_and_named(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(build, "check_lidar", lambda *_: LidarCheck((), ()))
+    for path in sorted((mine / "images/front").iterdir()):
+        cv2.imwrite(str(path.with_suffix(".jpg")), read_image(path)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+        path.unlink()
+    broken = mine / "images/front/000002.jpg"
+    broken.write_bytes(broken.read_bytes()[:2000])
+    assert cv2.imread(str(broken)) is not None, "OpenCV makes a picture of it"
+    report, said = run(mine, cameras=("front",))
+    assert [item.key for item in report.left_out] == ["front, frame 2"]
+    assert re.search(r"Left out: front, frame 2\. .*000002\.jpg: cannot be decoded .*2000 bytes; truncated", said)
+    frames = read_json(report.scene / "transforms.json")["frames"]
+    assert [frame["frame"] for frame in frames] == [0, 1, 3, 4, 5, 6]
+    assert not (report.scene / "images/front/0000000002.png").exists()
+    with pytest.raises(InputError, match=r"000002\.jpg: cannot be decoded"):
+        run(mine, output=mine.parent / "strict", strict=True, downscale=2, cameras=("front",))
+
+
+# ---- what is wrong with a recording ------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def seven(drive: Path) -> Recording:
+    """Frames of all cameras."""
+    return read_rig_recording(RigOptions(root=drive, output=drive.parent / "unused", frames=7))
+
+
+def test_a_camera_that_is_never_held_out_is_named(seven: Recording) -> None:
+    """As of two that take turns, when every 8th moment is always one of the first."""
+    turns = [
+        replace(picture, frame=2 * picture.frame + (picture.camera == "left"))
+        for picture in seven.pictures
+        if picture.camera != "front"
+    ]
+    alternating = replace(seven, pictures=tuple(turns))
+    (notice,) = _never_held_out(alternating, {4, 12}, 4)
+    assert notice.startswith("No picture of left is held out") and "--holdout-every 5" in notice
+    assert _never_held_out(alternating, {4, 9}, 4) == _never_held_out(seven, {4}, 4) == []
+    assert _never_held_out(alternating, set(), 4) == []
+
+
+def test_a_scanner_may_hang_head_down(seven: Recording) -> None:
+    """A path that is found is upright as the cameras are."""
+    trajectory = seven.trajectory
+    assert trajectory is not None
+    sweeps = [replace(sweep, to_vehicle=sweep.to_vehicle @ np.diag([1.0, -1.0, -1.0, 1.0])) for sweep in seven.sweeps]
+    turned = upright(replace(seven, sweeps=tuple(sweeps)), trajectory)
+    assert turned.vehicle_to_world == pytest.approx(upright(seven, trajectory).vehicle_to_world)
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_damaged_masks_and_scans_do_not_stop_what_looks_for_features(
+    seven: Recording, tmp_path: Path, strict: bool
+) -> None:
+    """They are reported when their maps are made."""
+    damaged = tmp_path / "mask.png"
+    damaged.write_bytes(b"no PNG")
+    options = RigOptions(root=tmp_path, output=tmp_path / "scene", strict=strict)
+    masks = FeatureMasks(seven, options, {camera.name: 1.5 for camera in seven.cameras})
+    picture = seven.pictures[0]
+    assert masks.of(picture).any()
+    if strict:
+        with pytest.raises(InputError, match=r"mask\.png"):
+            masks.of(replace(picture, mask=damaged))
+    else:
+        assert not masks.of(replace(picture, mask=damaged)).any()
+
+    def unreadable() -> Sweep:
+        raise InputError("none of its points can be used")
+
+    assert _scan(replace(seven.sweeps[0], read=unreadable), seven.trajectory) is None
+    assert _scan(seven.sweeps[0], seven.trajectory) is not None
+
+
+def test_process_says_it_before_the_work(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[LidarCheck] = []
+
+    def once(*given) -> LidarCheck:
+        found.append(found[0] if found else check_lidar(*given))
+        return found[0]
+
+    monkeypatch.setattr(build, "check_lidar", once)
+    rows = re.compile(r"(\[cameras\.left\].*?to_vehicle = )\[\n(.*?)\n\]", re.S)
+    given = rows.search((mine / "rig.toml").read_text())
+    assert given is not None
+    matrix = np.array(ast.literal_eval(f"[{given[2]}]"))
+    edit(mine, lambda text: rows.sub(lambda match: match[1] + str(np.linalg.inv(matrix).tolist()), text))
+    short = {"frames": 5, "cameras": ("left",)}
+    with pytest.raises(InputError, match=r"to_vehicle of left is inverted.*Without --strict"):
+        run(mine, strict=True, **short)
+    assert not (mine.parent / "scene/transforms.json").exists()
+    report, said = run(mine, **short)
+    (warning,) = report.warnings
+    assert "to_vehicle of left is inverted" in warning and warning in said
+    # a scene that is done is not looked at again, and what was found is said again
+    again, said = run(mine, **short)
+    assert again.written == 0 and again.warnings == report.warnings and warning in said and len(found) == 2
+    told = [one for one in find(read_scene(report.scene), []) if one.kind == "recording"]
+    assert [one.text.startswith(warning) for one in told] == [True]
+
+
+# ---- the vehicle -------------------------------------------------------------------------------------------------
+def test_the_vehicle_is_found_in_few_pictures_with_lidars_help(mine: Path) -> None:
+    edit(mine, lambda text: re.sub(r"ego_mask = .*\n", "", text))
+    options = RigOptions(root=mine, output=mine.parent / "scene", frames=7, cameras=("right",), theta_max_deg=110.0)
+    recording = read_rig_recording(options)
+    (notice,) = find_vehicle(recording, recording.pictures, options, Console(quiet=True))[1]
+    assert notice.startswith("right: the vehicle was detected")
+    true, kept = read_mask(mine / "masks/right.png"), read_mask(options.output / "ego_masks/right.png")
+    lens = lens_circle(recording.cameras[0].camera, 110.0)
+    vehicle, hidden = lens & ~true, lens & ~kept
+    assert (vehicle & hidden).sum() > 0.93 * (vehicle | hidden).sum()
+
+
+# ---- no LiDAR ----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("mono", "motion", "words"),
+    [
+        (True, True, "monocular maps only"),
+        (False, True, "distances from motion only"),
+        (False, False, "plain nerfacto"),
+    ],
+)
+def test_neither_lidar_nor_depth_is_said(mine: Path, drive: Path, mono: bool, motion: bool, words: str) -> None:
+    edit(mine, lambda text: text[: text.index("[lidars.roof]")])
+    if mono:
+        shutil.copytree(drive / "mono", mine / "mono")
+        edit(mine, lambda text: re.sub(r"\[cameras\.(\w+)\]\n", r'[cameras.\1]\nmono = "mono/\1"\n', text))
+    report, said = run(mine, motion=motion, cameras=("left",))
+    (notice,) = [one for one in report.notices if "neither LiDAR nor depth maps" in one]
+    assert words in notice and notice in said
+
+
+# ---- exposure ----------------------------------------------------------------------------------------------------
+def test_pictures_of_any_exposure_are_taken(mine: Path) -> None:
+    """Black, saturated, and of four times the exposure from one picture to the next: no crash, no NaN, no warning."""
+    for number, path in enumerate(sorted((mine / "images/left").iterdir())[:7]):
+        picture = read_image(path).astype(float) * (0.0, 1.0, 0.25, 1.0, 4.0, 1000.0, 1.0)[number]
+        write_png(path, picture.clip(0, 255).astype(np.uint8))
+    edit(mine, lambda text: re.sub(r"ego_mask = .*\n", "", text))
+    with np.errstate(invalid="raise", divide="raise", over="raise"):
+        report, _ = run(mine, cameras=("left",), refine_poses=True)
+    assert report.training + report.held_out == 7 and not report.left_out
+    assert not any("to_vehicle inverted" in one or "do not lie" in one for one in report.notices)
+    assert read_mask(report.scene / "masks/left.png").mean() > 0.2
+    assert (read_distance_png(report.scene / "lidar/left/0000000000.png") > 0).any()
