@@ -21,7 +21,9 @@ from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.lidar.world import WorldSweep, sweep_in_world
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.moving import clearest_edge, grow_moving
+from edge_depth_nerf.process import build
 from edge_depth_nerf.process.converters import convert, read_drive
+from edge_depth_nerf.process.lidar_checks import LidarCheck
 from edge_depth_nerf.process.moving import MOVING_MASKS, find_moving, moving_mask_path
 from edge_depth_nerf.process.options import RigOptions
 from edge_depth_nerf.process.recording import Recording
@@ -213,6 +215,14 @@ def options(root: Path, output: Path, **more: object) -> RigOptions:
     return RigOptions(root=root, output=output, **given)  # pyright: ignore[reportArgumentType]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def lidar_is_not_checked():
+    """It takes longer than the rest, and is of test_wrong_recordings.py."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "check_lidar", lambda *_: LidarCheck((), ()))
+        yield
+
+
 @pytest.fixture(scope="module")
 def processed(drive: Path) -> Path:
     """Its scene, where frames 4 and 12 are held out."""
@@ -260,37 +270,29 @@ def test_what_moves_in_a_drive_is_masked_and_masks_can_be_corrected(
 def test_training_pictures_know_nothing_of_sweeps_that_are_held_out(
     drive: Path, processed: Path, tmp_path: Path
 ) -> None:
-    wanted = options(drive, tmp_path / "without", cameras=("left",))
+    """And a picture that is damaged gets no mask."""
+    root = Path(shutil.copytree(drive, tmp_path / "drive"))
+    wanted = options(root, tmp_path / "without", cameras=("left",))
     recording = read_drive(wanted)
     kept = tuple(sweep for sweep in recording.sweeps if sweep.frame not in (4, 12))
     assert len(kept) < len(recording.sweeps)
-    found = found_again(dataclasses.replace(recording, sweeps=kept), wanted)
+    recording = dataclasses.replace(recording, sweeps=kept)
+    training = [picture for picture in recording.pictures if picture.frame not in (4, 12)]
+    damaged = next(picture for picture in training if not read_mask(moving_mask_path(processed, picture)).all())
+    content = bytearray(damaged.path.read_bytes())
+    content[len(content) // 2] ^= 0x5A
+    damaged.path.write_bytes(content)
     masks = []
-    for picture in found.pictures:
-        if picture.frame not in (4, 12):
-            with_them = moving_mask_path(processed, picture)
+    for picture in found_again(recording, wanted).pictures:
+        with_them = moving_mask_path(processed, picture)
+        if picture.path == damaged.path:
+            assert picture.moving_mask is None
+        elif picture.frame not in (4, 12):
             assert picture.moving_mask is not None and picture.moving_mask != with_them
             masks.append((read_mask(with_them), read_mask(picture.moving_mask)))
     assert sum((~mask).sum() for mask, _ in masks) > 100
-    assert all(np.array_equal(*each) for each in masks)
-
-
-@pytest.mark.slow
-def test_a_picture_that_is_damaged_gets_no_mask(drive: Path, processed: Path, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(drive, tmp_path / "drive"))
-    wanted = options(root, tmp_path / "scene", cameras=("left",))
-    recording = read_drive(wanted)
-    shutil.copytree(processed / MOVING_MASKS, wanted.output / MOVING_MASKS)
-    paths = {picture.path: moving_mask_path(wanted.output, picture) for picture in recording.pictures}
-    hidden = [path for path, mask in paths.items() if not read_mask(mask).all()]
-    assert hidden
-    paths[hidden[0]].unlink()
-    content = bytearray(hidden[0].read_bytes())
-    content[len(content) // 2] ^= 0x5A
-    hidden[0].write_bytes(content)
-    found = found_again(recording, wanted)
-    assert [picture.path for picture in found.pictures if picture.moving_mask is None] == [hidden[0]]
-    with pytest.raises(InputError, match=hidden[0].name):
+    assert len(masks) == len(training) - 1 and all(np.array_equal(*each) for each in masks)
+    with pytest.raises(InputError, match=damaged.path.name):
         found_again(recording, dataclasses.replace(wanted, strict=True))
 
 
