@@ -164,22 +164,13 @@ def test_mei_ends_at_arccos_of_minus_one_over_xi(camera: MEI, degrees: float) ->
 
 
 @pytest.mark.parametrize("camera", [*KITTI, *(p for p in CAMERAS if p.id in ("fisheye", "fisheye-folding"))])
-@pytest.mark.parametrize("degrees", [120.0, 150.0, 179.9, 180.0])
-def test_nothing_folds_back_into_the_picture(camera: Camera, degrees: float) -> None:
-    points = rays(math.radians(degrees)) * torch.tensor([0.1, 1.0, 80.0, 200.0]).repeat(6)[:, None]
+def test_nothing_folds_back_into_the_picture(camera: Camera) -> None:
+    theta = torch.deg2rad(torch.tensor([120.0, 150.0, 179.9, 180.0], dtype=torch.float64))
+    points = rays(theta) * torch.tensor([0.1, 1.0, 80.0, 200.0]).repeat(6)[:, None]
     pixels, valid = camera.project(points)
     assert not valid.any()
     assert pixels.isnan().all()
     assert not camera.inside(pixels).any()
-
-
-@each_camera
-def test_validity_ends_at_theta_max(camera: Camera) -> None:
-    limit = camera.theta_max_rad
-    assert camera.project(rays(limit - 1e-7))[1].all()
-    if limit < math.pi:
-        beyond = torch.linspace(limit + 1e-9, math.pi, 100, dtype=torch.float64)
-        assert not camera.project(rays(beyond))[1].any()
 
 
 @each_camera
@@ -191,6 +182,8 @@ def test_no_two_rays_share_a_pixel(camera: Camera) -> None:
     pixels, valid = camera.project(points)
     theta = torch.atan2(points[:, :2].norm(dim=-1), points[:, 2])
     assert torch.equal(valid, theta <= camera.theta_max_rad)
+    assert camera.project(rays(camera.theta_max_rad - 1e-7))[1].all()
+    assert camera.theta_max_rad == math.pi or not camera.project(rays(camera.theta_max_rad + 1e-9))[1].any()
     back, found = camera.unproject(pixels[valid])
     assert found.all()
     assert angle(back, torch.nn.functional.normalize(points[valid], dim=-1)).max() < 1e-6
@@ -323,14 +316,13 @@ def test_cameras_agree_with_cv2(camera: Camera, theta_max_rad: float, project: C
 
 # -- the axis, 90°, and what is no point at all -------------------------------------------------------------
 @each_camera
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_the_axis_goes_exactly_to_the_principal_point(camera: Camera, dtype: torch.dtype) -> None:
-    pixels, seen = camera.project(torch.tensor([[0, 0, 1], [0, 0, 1e-3], [0, 0, 250]], dtype=dtype))
-    assert seen.all()
-    assert torch.equal(pixels, torch.tensor([[camera.cx, camera.cy]] * 3, dtype=dtype))
-    direction, found = camera.unproject(torch.tensor([camera.cx, camera.cy], dtype=dtype))
-    assert found
-    assert direction.tolist() == [0.0, 0.0, 1.0]
+def test_the_axis_goes_exactly_to_the_principal_point(camera: Camera) -> None:
+    for dtype in (torch.float64, torch.float32):
+        pixels, seen = camera.project(torch.tensor([[0, 0, 1], [0, 0, 1e-3], [0, 0, 250]], dtype=dtype))
+        assert seen.all()
+        assert torch.equal(pixels, torch.tensor([[camera.cx, camera.cy]] * 3, dtype=dtype))
+        direction, found = camera.unproject(torch.tensor([camera.cx, camera.cy], dtype=dtype))
+        assert found and direction.tolist() == [0.0, 0.0, 1.0]
 
 
 @each_camera
@@ -440,7 +432,7 @@ def test_pixel_centres_and_inside() -> None:
 
 
 @each_camera
-@pytest.mark.parametrize("factor", [1, 2, 3, 8])
+@pytest.mark.parametrize("factor", [1, 3])
 def test_downscaled_projects_to_pixels_over_factor(camera: Camera, factor: int) -> None:
     small = camera.downscaled(factor)
     assert type(small) is type(camera)
@@ -450,10 +442,10 @@ def test_downscaled_projects_to_pixels_over_factor(camera: Camera, factor: int) 
     torch.testing.assert_close(small.project(points)[0], camera.project(points)[0] / factor, rtol=1e-12, atol=1e-9)
 
 
-@pytest.mark.parametrize("factor", [0, -2, 1401])
-def test_downscaled_refuses_what_leaves_no_picture(factor: int) -> None:
-    with pytest.raises(InputError, match=rf"{factor}.*1 to 1400"):
-        IMAGE_02.downscaled(factor)
+def test_downscaled_refuses_what_leaves_no_picture() -> None:
+    for factor in (0, -2, 1401):
+        with pytest.raises(InputError, match=rf"{factor}.*1 to 1400"):
+            IMAGE_02.downscaled(factor)
 
 
 @each_camera
@@ -462,12 +454,6 @@ def test_cameras_survive_files_and_processes(camera: Camera) -> None:
     camera.project(torch.rand(4, 3))  # fills what is computed once
     copy = pickle.loads(pickle.dumps(camera))
     assert copy == camera and hash(copy) == hash(camera)
-
-
-def test_to_dict_holds_every_parameter() -> None:
-    common = ("model", "width", "height", "fx", "fy", "cx", "cy", "theta_limit_rad")
-    assert list(IMAGE_02.to_dict()) == [*common, "xi", "k1", "k2", "p1", "p2"]
-    assert list(FISHEYE.to_dict()) == [*common, "k1", "k2", "k3", "k4", "p1", "p2"]
 
 
 @pytest.mark.parametrize(
@@ -523,10 +509,10 @@ def test_missing_parameters_are_named() -> None:
         camera_from_dict(parameters, "here")
 
 
-@pytest.mark.parametrize("limit", [0.0, -1.0, 3.2])
-def test_a_limit_that_is_no_angle_is_refused(limit: float) -> None:
-    with pytest.raises(InputError, match="theta_limit_rad"):
-        replace(FISHEYE, theta_limit_rad=limit)
+def test_a_limit_that_is_no_angle_is_refused() -> None:
+    for limit in (0.0, -1.0, 3.2):
+        with pytest.raises(InputError, match="theta_limit_rad"):
+            replace(FISHEYE, theta_limit_rad=limit)
 
 
 # -- nerfstudio ---------------------------------------------------------------------------------------------

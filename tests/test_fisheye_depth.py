@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shlex
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -126,63 +127,56 @@ def test_what_is_there_stays_unless_its_map_is_newer(folder):
         run(folder, theta_max_deg=80.0)
 
 
-def test_a_mask_hides_pixels(folder):
+def test_a_mask_hides_pixels_and_a_view_may_have_no_value(folder):
     mask = np.full((160, 160), 255, np.uint8)
     mask[100:] = 0
     write_png(folder / "mask.png", mask)
-    out = run(folder, maps=write_maps(folder, "relative"), maps_kind="relative", mask=folder / "mask.png")
-    found = np.load(out / "distance/a.npy")
+    given = {"maps": write_maps(folder, "relative"), "maps_kind": "relative"}
+    found = np.load(run(folder, **given, mask=folder / "mask.png") / "distance/a.npy")
     assert (found[100:] == 0).all() and (found[:100][FOUND.within[:100]] > 0).mean() > 0.97
-
-
-def test_a_view_may_have_no_value(folder):
-    maps = write_maps(folder, "relative")
-    size = VIEWS[0].height, VIEWS[0].width
-    np.save(maps / "a_3.npy", np.full(size, np.nan, np.float32))
-    found = np.load(run(folder, maps=maps, maps_kind="relative") / "distance/a.npy")
+    shutil.rmtree(folder / "out")
+    np.save(folder / "maps/a_3.npy", np.full((VIEWS[0].height, VIEWS[0].width), np.nan, np.float32))
+    found = np.load(run(folder, **given) / "distance/a.npy")
     ratio = found[found > 0] / TRUTH[found > 0]
     assert 0.7 < (found > 0).sum() / FOUND.within.sum() < 1
     assert np.abs(ratio / np.median(ratio) - 1).mean() < 0.005
 
 
-def spoil(folder: Path, what: str) -> None:
-    maps, pictures = folder / "maps", folder / "pictures"
-    if what == "missing view":
-        (maps / "b_4.npy").unlink()
-    elif what == "size":
-        np.save(maps / "a_1.npy", np.ones((20, 30), np.float32))
-    elif what == "no number":
-        for path in maps.glob("b_*"):
-            np.save(path, np.full(np.load(path).shape, np.nan))
-    elif what == "calibration":
-        (folder / "lens.toml").unlink()
-    elif what == "model":
-        (folder / "lens.toml").write_text("model = 'fisheye'\n")
-    elif what == "picture size":
-        write_png(pictures / "b.png", np.zeros((120, 160, 3), np.uint8))
-    elif what == "names":
-        (pictures / "b.webp").write_bytes(b"")
-    else:
-        for path in pictures.iterdir():
-            path.unlink()
+def no_number(folder: Path) -> None:
+    for path in (folder / "maps").glob("b_*"):
+        np.save(path, np.full(np.load(path).shape, np.nan))
+
+
+def no_picture(folder: Path) -> None:
+    for path in (folder / "pictures").iterdir():
+        path.unlink()
 
 
 @pytest.mark.parametrize(
-    ("what", "expected"),
+    ("spoil", "expected"),
     [
-        ("missing view", r"b_4\.npy: no such file, nor b_4\.png"),
-        ("size", rf"a_1\.npy: is 30×20 \(width × height\), its picture a_1 {VIEWS[1].width}×{VIEWS[1].height}"),
-        ("no number", r"b_0\.npy: neither this map nor one of the picture's other views contains a positive number"),
-        ("calibration", r"lens\.toml: no such file\. --calibration names"),
-        ("model", r"lens\.toml: camera: model is 'fisheye', expected one of mei, kannala-brandt"),
-        ("picture size", r"b\.png: .*160.*120"),
-        ("names", r"several pictures b\. Keep one"),
-        ("pictures", r"has no picture; expected files that end in \.png"),
+        (lambda folder: (folder / "maps/b_4.npy").unlink(), r"b_4\.npy: no such file, nor b_4\.png"),
+        (
+            lambda folder: np.save(folder / "maps/a_1.npy", np.ones((20, 30), np.float32)),
+            rf"a_1\.npy: is 30×20 \(width × height\), its picture a_1 {VIEWS[1].width}×{VIEWS[1].height}",
+        ),
+        (no_number, r"b_0\.npy: neither this map nor one of the picture's other views contains a positive number"),
+        (lambda folder: (folder / "lens.toml").unlink(), r"lens\.toml: no such file\. --calibration names"),
+        (
+            lambda folder: (folder / "lens.toml").write_text("model = 'fisheye'\n"),
+            r"lens\.toml: camera: model is 'fisheye', expected one of mei, kannala-brandt",
+        ),
+        (
+            lambda folder: write_png(folder / "pictures/b.png", np.zeros((120, 160, 3), np.uint8)),
+            r"b\.png: .*160.*120",
+        ),
+        (lambda folder: (folder / "pictures/b.webp").write_bytes(b""), r"several pictures b\. Keep one"),
+        (no_picture, r"has no picture; expected files that end in \.png"),
     ],
 )
-def test_what_is_wrong_is_named(folder, what, expected):
+def test_what_is_wrong_is_named(folder, spoil, expected):
     maps = write_maps(folder, "inverse")
-    spoil(folder, what)
+    spoil(folder)
     with pytest.raises((InputError, FileNotFoundError), match=expected):
         run(folder, maps=maps, maps_kind="inverse")
 

@@ -32,9 +32,6 @@ def test_leaves_out_and_counts_what_is_no_point(tmp_path: Path) -> None:
     sweep = read_sweep(write(tmp_path / "a.bin", [[*row, 0] for row in rows]))
     assert sweep.points_m.tolist() == [[1, 0, 0], [0, 0, 9]]
     assert (sweep.not_finite, sweep.out_of_range) == (2, 3)
-
-
-def test_missing_sweep_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"b\.bin"):
         read_sweep(tmp_path / "b.bin")
 
@@ -94,23 +91,18 @@ def test_what_is_behind_never_shows_through() -> None:
     assert seen.point_index.max() == 0
 
 
-def test_indices_name_the_points() -> None:
-    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    seen = project_points(points, FISHEYE)
-    hit = seen.point_index >= 0
-    assert torch.equal(points[seen.point_index[hit]].norm(dim=-1), seen.distance_m[hit])
-
-
 def test_of_equal_points_the_first_counts() -> None:
     points = torch.tensor([[0.0, 0, 9], [0, 0, 3], [0, 0, 3]], dtype=torch.float64)
     assert project_points(points, PINHOLE).point_index.max() == 1
 
 
-def test_distances_scale_with_the_points() -> None:
+def test_indices_name_the_points_and_distances_scale_with_them() -> None:
     points = torch.randn(500, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     one, four = project_points(points, FISHEYE), project_points(4 * points, FISHEYE)
     torch.testing.assert_close(four.distance_m, 4 * one.distance_m)
     assert torch.equal(one.point_index, four.point_index)
+    hit = one.point_index >= 0
+    assert torch.equal(points[one.point_index[hit]].norm(dim=-1), one.distance_m[hit])
 
 
 def test_sees_beside_and_behind_but_nothing_folds_back() -> None:

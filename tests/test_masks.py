@@ -90,9 +90,11 @@ def test_pictures_without_dark_rim_have_none() -> None:
     assert lens.dark_rim([]) is None
 
 
-def test_dark_rim_refuses_pictures_of_different_sizes() -> None:
+def test_pictures_of_different_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match="different sizes"):
         lens.dark_rim([np.zeros((40, 40, 3), np.uint8), np.zeros((40, 41, 3), np.uint8)])
+    with pytest.raises(ValueError, match="lens mask"):
+        ego.find_ego([lambda: np.zeros((SIZE, SIZE + 1, 3), np.uint8)], lens_disc())
 
 
 # ---- the vehicle -----------------------------------------------------------------------------------------------
@@ -134,7 +136,7 @@ class SlidingWorld:
         return [self.picture(step_px * k, k, 0.1 * np.sin(k / 3)) for k in range(count)]
 
 
-@pytest.mark.parametrize("count", [12, 40])
+@pytest.mark.parametrize("count", [12, 24])
 def test_the_vehicle_is_found_and_nothing_else(count: int) -> None:
     world = SlidingWorld(vehicle_shape())
     found = ego.find_ego(world.drive(count), world.lens)
@@ -187,11 +189,11 @@ def test_why_no_vehicle_is_found() -> None:
     few = ego.find_ego(world.drive(ego.MIN_PICTURES - 1), world.lens)
     assert isinstance(few, ego.NoEgo)
     assert "too few" in few.reason and not few.could_tell
-    standing = ego.find_ego([world.picture(0, k) for k in range(30)], world.lens)
+    standing = ego.find_ego([world.picture(0, k) for k in range(16)], world.lens)
     assert isinstance(standing, ego.NoEgo)
     assert "stands" in standing.reason and not standing.could_tell
     bare = SlidingWorld(None)
-    none = ego.find_ego(bare.drive(30), bare.lens)
+    none = ego.find_ego(bare.drive(16), bare.lens)
     assert isinstance(none, ego.NoEgo) and none.could_tell
     assert ego.find_ego([], np.zeros((SIZE, SIZE), bool)) == ego.NoEgo("The lens mask leaves no pixel.", False)
 
@@ -215,7 +217,7 @@ def test_road_without_texture_is_not_taken_for_the_vehicle(first_row: int) -> No
     """What is near may pass too fast to show texture: it stays the same, and what lies beyond clearly changes."""
     bare = SlidingWorld(None)
     bare.world[first_row:] = 90
-    found = ego.find_ego(bare.drive(30), bare.lens)
+    found = ego.find_ego(bare.drive(16), bare.lens)
     assert isinstance(found, ego.NoEgo)
     assert "smooth road" in found.reason
 
@@ -262,11 +264,6 @@ def test_pictures_of_a_long_drive_are_thinned_out() -> None:
     assert ego.MAX_PICTURES / 2 <= found.pictures < ego.MAX_PICTURES
     assert len(loaded) < 200
     assert loaded[-1] > 290, "the end of the drive was looked at as well"
-
-
-def test_a_picture_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match="lens mask"):
-        ego.find_ego([lambda: np.zeros((SIZE, SIZE + 1, 3), np.uint8)], lens_disc())
 
 
 # ---- semantics -------------------------------------------------------------------------------------------------
@@ -341,15 +338,6 @@ def outdoors() -> tuple[Picture, Mask]:
     return np.clip(rgb + noise, 0, 255).astype(np.uint8), ~house & (y < SIZE / 2)
 
 
-def test_sky_is_found_above_the_horizon() -> None:
-    picture, true = outdoors()
-    found = sky.find_sky(picture, USE, UP, CAMERA, NO_LIDAR)
-    assert not (found & ~true).any()
-    _, y = pixels()
-    # the lowest degree is left out
-    assert found[true & (y < SIZE / 2 - FOCAL_PX * np.tan(np.radians(2.0)))].mean() > 0.97
-
-
 def test_sky_ends_at_the_horizon_though_the_ground_is_as_bright() -> None:
     found = sky.find_sky(as_picture(np.full((SIZE, SIZE), 230.0), 0), USE, UP, CAMERA, NO_LIDAR)
     _, y = pixels()
@@ -366,14 +354,6 @@ def test_up_decides_where_the_horizon_is() -> None:
     assert not (found & ~np.rot90(true, -1)).any()
     # upside down: the bright half is ground
     assert not sky.find_sky(picture, USE, -UP, CAMERA, NO_LIDAR).any()
-
-
-def test_a_white_van_beside_the_camera_does_not_hide_the_sky() -> None:
-    picture, _ = outdoors()
-    x, y = pixels()
-    picture[(y > SIZE / 2) & (x > 80)] = 210
-    alone = sky.find_sky(outdoors()[0], USE, UP, CAMERA, NO_LIDAR)
-    assert sky.find_sky(picture, USE, UP, CAMERA, NO_LIDAR).sum() > 0.99 * alone.sum()
 
 
 def test_what_is_known_to_be_near_is_not_sky() -> None:
@@ -396,11 +376,7 @@ def test_what_is_known_to_be_near_is_not_sky() -> None:
 
 
 def test_ceilings_are_not_sky() -> None:
-    x, y = pixels()
-    ceiling = as_picture(np.where(y < SIZE / 2, 115.0, 90.0), 0)
-    # a lamp
-    ceiling[(np.abs(x - 120) < 40) & (np.abs(y - 30) < 3)] = 255
-    assert not sky.find_sky(ceiling, USE, UP, CAMERA, NO_LIDAR).any()
+    _, y = pixels()
     # a beam with light on it in a dark place
     beam = as_picture(np.where(np.abs(y - 50) < 15, 125.0, 75.0), 0)
     assert not sky.find_sky(beam, USE, UP, CAMERA, NO_LIDAR).any()
@@ -410,8 +386,6 @@ def test_ceilings_are_not_sky() -> None:
     distance = np.where(y < SIZE / 2, 2.0 / np.maximum(np.sin(np.arctan2(SIZE / 2 - y, FOCAL_PX)), 1e-3), 3.0)
     near = np.minimum(distance, 250).astype(np.float32)
     assert not sky.find_sky(white, USE, UP, CAMERA, NO_LIDAR, near).any()
-    night = (outdoors()[0] * 0.3).astype(np.uint8)
-    assert not sky.find_sky(night, USE, UP, CAMERA, NO_LIDAR).any()
 
 
 def test_incomplete_blocks_of_large_pictures() -> None:

@@ -158,6 +158,7 @@ def test_pictures_without_a_sky() -> None:
     bridge[box(100, 140, 20, 24)] = 255
     ceiling = np.full((HEIGHT, WIDTH, 3), 165.0)
     ceiling[HORIZON:] = 140
+    ceiling[box(120, 240, 26, 32)] = 255
     for colours in (tunnel, bridge, ceiling, np.zeros_like(tunnel), np.full_like(tunnel, 300.0), 0.25 * street()[0]):
         assert not found_in(colours).any()
     down = np.array([0.0, -0.2, -0.98])

@@ -57,6 +57,10 @@ def found(views: list[View], index: int = MIDDLE) -> MotionDistance:
     return motion.confirm(index, motion.sweep)
 
 
+def other_grey(view: View, grey: np.ndarray) -> View:
+    return View(grey.astype(np.float32), view.camera, view.camera_to_world, view.theta_max_rad)
+
+
 def errors(distance: MotionDistance, truth_m: np.ndarray) -> np.ndarray:
     kept = distance.distance_m > 0
     assert kept.any()
@@ -64,9 +68,18 @@ def errors(distance: MotionDistance, truth_m: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def ball() -> tuple[list[View], np.ndarray]:
-    views = [in_ball(FISHEYE, pose(x, 0.1 * x, 0.05, 0.1 * x)) for x in STEPS]
-    return [view for view, _ in views], views[MIDDLE][1]
+def balls() -> list[tuple[View, np.ndarray]]:
+    return [in_ball(FISHEYE, pose(x, 0.1 * x, 0.05, 0.1 * x)) for x in STEPS]
+
+
+@pytest.fixture(scope="module")
+def ball(balls) -> tuple[list[View], np.ndarray]:
+    return [view for view, _ in balls], balls[MIDDLE][1]
+
+
+@pytest.fixture(scope="module")
+def wall() -> list[View]:
+    return [of_wall(WALL, pose(x))[0] for x in STEPS]
 
 
 @pytest.fixture(scope="module")
@@ -74,11 +87,10 @@ def of_ball(ball) -> MotionDistance:
     return found(ball[0])
 
 
-def test_neighbours_distances_are_seen_where_they_lie(ball):
+def test_neighbours_distances_are_seen_where_they_lie(balls, ball):
     views, truth = ball
     others = [number for number in range(len(STEPS)) if number != MIDDLE]
-    theirs = [in_ball(FISHEYE, pose(x, 0.1 * x, 0.05, 0.1 * x))[1] for x in STEPS]
-    theirs = [np.where(views[number].used, theirs[number], 0).astype(np.float32) for number in others]
+    theirs = [np.where(views[number].used, balls[number][1], 0).astype(np.float32) for number in others]
     # one of four is wrong
     theirs[0] = 0.5 * theirs[0]
     seen_m = seen_around(views[MIDDLE], [views[number] for number in others], theirs)
@@ -247,10 +259,9 @@ def test_distances_in_a_ball_are_right_also_beyond_90_deg(ball, of_ball):
     assert kept[views[MIDDLE].used].mean() > 0.6
 
 
-def test_distances_of_a_slanted_wall_are_right():
-    views = [of_wall(WALL, pose(x)) for x in STEPS]
-    of_middle = found([view for view, _ in views])
-    error = errors(of_middle, views[MIDDLE][1])
+def test_distances_of_a_slanted_wall_are_right(wall):
+    of_middle = found(wall)
+    error = errors(of_middle, of_wall(WALL, pose(STEPS[MIDDLE]))[1])
     assert (of_middle.distance_m > 0).mean() > 0.6
     assert np.median(error) < 0.01
     assert np.quantile(error, 0.95) < 0.05
@@ -271,15 +282,13 @@ def test_confidence_is_said_where_there_is_a_distance_and_nowhere_else(of_ball):
     assert not of_ball.confidence[~kept].any() and not of_ball.parallax_px[~kept].any()
 
 
-def test_the_doubtful_are_wrong_more_often():
+def test_the_doubtful_are_wrong_more_often(ball):
     rng = np.random.default_rng(4)
-    views, truths = zip(*(in_ball(FISHEYE, pose(x, 0.1 * x, 0.05, 0.1 * x)) for x in STEPS), strict=True)
+    views, truth = ball
     # noise as strong as the texture
-    for view in views:
-        view.grey[...] += rng.normal(0, 40, view.grey.shape).astype(np.float32)
-    of_noisy = found(list(views))
+    of_noisy = found([other_grey(view, view.grey + rng.normal(0, 40, view.grey.shape)) for view in views])
     kept = of_noisy.distance_m > 0
-    wrong = np.abs(of_noisy.distance_m - truths[MIDDLE]) / truths[MIDDLE] > 0.1
+    wrong = np.abs(of_noisy.distance_m - truth) / truth > 0.1
     sure = of_noisy.confidence > np.median(of_noisy.confidence[kept])
     assert kept.sum() > 1000
     assert wrong[kept & sure].mean() < wrong[kept & ~sure].mean()
@@ -297,17 +306,13 @@ def test_along_the_direction_of_travel_there_is_none():
     assert np.median(errors(ahead, views[MIDDLE][1])) < 0.03
 
 
-@pytest.mark.parametrize("turn_rad", [0.0, 0.2])
-def test_standing_still_and_turning_on_the_spot_give_none(turn_rad):
-    views = [in_ball(FISHEYE, pose(0.5, 0.0, 0.0, turn_rad * number))[0] for number in range(5)]
-    assert choose_neighbours(views[MIDDLE], [views[0], views[1], views[3]]) == []
-    assert not found(views).distance_m.any()
-
-
-def test_a_vehicle_that_trembles_gives_none():
-    rng = np.random.default_rng(2)
-    shaken = [pose(x, y, z, 0.1 * number) for number, (x, y, z) in enumerate(rng.normal(0, 0.002, (5, 3)))]
-    views = [in_ball(FISHEYE, place)[0] for place in shaken]
+def test_standing_still_turning_on_the_spot_and_trembling_give_none():
+    for turn_rad in (0.0, 0.2):
+        views = [in_ball(FISHEYE, pose(0.5, 0.0, 0.0, turn_rad * number))[0] for number in range(5)]
+        assert choose_neighbours(views[MIDDLE], [views[0], views[1], views[3]]) == []
+        assert not found(views).distance_m.any()
+    shaken = np.random.default_rng(2).normal(0, 0.002, (5, 3))
+    views = [in_ball(FISHEYE, pose(x, y, z, 0.1 * number))[0] for number, (x, y, z) in enumerate(shaken)]
     assert not found(views).distance_m.any()
 
 
@@ -316,30 +321,22 @@ def test_a_wall_without_texture_has_none():
     assert (found(views).distance_m > 0).mean() < 0.002
 
 
-def test_two_pictures_give_none():
-    views = [of_wall(WALL, pose(x))[0] for x in STEPS]
-    assert not found([views[0], views[MIDDLE]], 1).distance_m.any()
-    assert found([views[0], views[MIDDLE], views[4]], 1).distance_m.any()
+def test_two_pictures_give_none(wall):
+    assert not found([wall[0], wall[MIDDLE]], 1).distance_m.any()
+    assert found([wall[0], wall[MIDDLE], wall[4]], 1).distance_m.any()
 
 
 def test_exposure_that_jumps_by_two_stops_changes_little(ball, of_ball):
     views, truth = ball
-    darker = [
-        View(np.rint(view.grey / 4), view.camera, view.camera_to_world, view.theta_max_rad) if number % 2 else view
-        for number, view in enumerate(views)
-    ]
-    of_jumping = found(darker)
+    of_jumping = found([other_grey(view, np.rint(view.grey / 4)) if n % 2 else view for n, view in enumerate(views)])
     assert (of_jumping.distance_m > 0).sum() > 0.8 * (of_ball.distance_m > 0).sum()
     assert np.median(errors(of_jumping, truth)) < 0.02
 
 
-def test_pictures_that_show_something_else_give_none():
-    views = [of_wall(WALL, pose(x))[0] for x in STEPS]
+def test_pictures_that_show_something_else_give_none(wall):
     rng = np.random.default_rng(5)
-    other = [
-        View(rng.uniform(0, 255, view.grey.shape).astype(np.float32), WALL, view.camera_to_world) for view in views
-    ]
-    other[MIDDLE] = views[MIDDLE]
+    other = [other_grey(view, rng.uniform(0, 255, view.grey.shape)) for view in wall]
+    other[MIDDLE] = wall[MIDDLE]
     assert (found(other).distance_m > 0).mean() < 0.005
 
 
