@@ -193,13 +193,9 @@ def weights(folder: Path) -> Path:
 
 def figures(folder: Path) -> Path:
     run = asdict(RunSpecification("scene", "0" * 64, "lite", "edge", 0, None))
-    write_json(
-        folder / "scene/edge_seed-0/figures.json",
-        {
-            **{"run": run, "named": ["pipeline.model.depth_loss"], "configuration": {"a": 1}, "steps": 10},
-            **{"figures": {"psnr": 20.0}, "curve": [{"step": 10.0, "psnr": 20.0}]},
-        },
-    )
+    content = {"run": run, "named": ["pipeline.model.depth_loss"], "configuration": {"a": 1}, "steps": 10}
+    content |= {"figures": {"psnr": 20.0}, "curve": [{"step": 10.0, "psnr": 20.0}]}
+    write_json(folder / "scene/edge_seed-0/figures.json", content)
     return folder / "scene/edge_seed-0/figures.json"
 
 
@@ -227,14 +223,8 @@ CAMCHAIN = """cam0:
   - [1.0, 0.0, 0.0, 0.1]
   resolution: [16, 12]
 """
-BASALT = {
-    "value0": {
-        "intrinsics": [
-            {"camera_type": "ucm", "intrinsics": {"fx": 6.5, "fy": 6.5, "cx": 8.0, "cy": 6.0, "alpha": 0.5}}
-        ],
-        "resolution": [[16, 12]],
-    }
-}
+SPHERE = {"camera_type": "ucm", "intrinsics": {"fx": 6.5, "fy": 6.5, "cx": 8.0, "cy": 6.0, "alpha": 0.5}}
+BASALT = {"value0": {"intrinsics": [SPHERE], "resolution": [[16, 12]]}}
 OCAM = "#polynomial\n\n3 -3.2 0.0 0.045\n\n#inverse\n\n2 1 2\n\n5.6 7.7\n\n0.999 2e-3 -1e-3\n\n12 16\n"
 
 OURS: dict[str, Reader] = {
@@ -307,34 +297,17 @@ def scan(path: Path) -> None:
     read_scan(path, ScanFormat())
 
 
-# ---- faults ----------------------------------------------------------------------------------------------------
 WORDS = (
     *("nan", "inf", "-inf", "-1", "0", "1e308", "-1e308", "1e-320", "9" * 400, "9" * 5000, "0x10", "1_0", "true"),
-    *(
-        "²",
-        "١",
-        "\x00",
-        "\u202e",
-        "\x1b[2J",
-        "\ud7ff",
-        "../../etc/passwd",
-        "/etc/passwd",
-        "~",
-        "**",
-        "[",
-        "",
-        "a" * 300,
-    ),
+    *("²", "١", "\x00", "\u202e", "\x1b[2J", "\ud7ff", "../../etc/passwd", "/etc/passwd", "~", "**", "[", ""),
+    "a" * 300,
     *("&a [*a,*a]", "*a", "!!python/object/apply:os.system ['true']", "<<: *a", "%s%n", "[" * 3000, "{" * 3000, "'''"),
     *("element vertex 99999999999", "COUNT 1000000000 1 1 1", "SIZE 4 4 4 99", "POINTS -1", "a.b.c.d = 1", "[[", "}}"),
 )
 VALUES: tuple[Any, ...] = (
     *(None, True, False, -1, 0, 1e308, -1e308, 10**400, 2**31, 2**63, 0.5, float("nan"), float("inf"), "", "x", "²"),
     *("../x", "/etc/passwd", "a\0b", "\udc80", "x" * 300, [], {}, [[]], [None], [[1, 2], [3]], {"a": {}}, ["x", 1]),
-    [[float("nan")] * 4] * 4,
-    [["1"] * 4] * 4,
-    [1e300] * 6,
-    "images/../../x",
+    *([[float("nan")] * 4] * 4, [["1"] * 4] * 4, [1e300] * 6, "images/../../x"),
 )
 SIZES = (0, 1, 2**7, 2**15, 60000, 2**16 - 1, 2**16, 2**31 - 1, 2**31, 2**32 - 1)
 
@@ -429,12 +402,11 @@ def _png(content: bytes, rng: Random) -> bytes:
 
 def _npy(content: bytes, rng: Random) -> bytes:
     """Another shape, type or order in an array's header."""
+    shapes = (b"(99999999999,)", b"(-1, 16)", b"()", b"(True, 2)", b"(2**40,)", b"(0, 9)")
+    kinds = (b"'|O'", b"'<f2'", b"'<M8[s]'", b"'|V99999999'", b"[('x','<f4')]", b"'<f4,<i8'")
     swaps = (
-        (rb"\(\d+, ?\d*\)", rng.choice((b"(99999999999,)", b"(-1, 16)", b"()", b"(True, 2)", b"(2**40,)", b"(0, 9)"))),
-        (
-            rb"'[<|]\w\d+'",
-            rng.choice((b"'|O'", b"'<f2'", b"'<M8[s]'", b"'|V99999999'", b"[('x','<f4')]", b"'<f4,<i8'")),
-        ),
+        (rb"\(\d+, ?\d*\)", rng.choice(shapes)),
+        (rb"'[<|]\w\d+'", rng.choice(kinds)),
         (rb"False", rng.choice((b"True", b"0", b"open('x')", b"(" * 400, b"-" * 4000 + b"1"))),
         (rb"\{", rng.choice((b"{{", b"", b"{'shape': (1,),"))),
     )

@@ -6,6 +6,7 @@ each of our own parsers through a coverage-guided fuzzer (tests/fuzz_parsers.py)
 
 import json
 import os
+import re
 import struct
 import sys
 import time
@@ -116,6 +117,7 @@ def frame(**changes: Any) -> str:
     return json.dumps({"frames": [{**FRAME, "cx": 4, "cy": 4, **changes}]})
 
 
+LONG_COUNTS = re.sub(rb"(WIDTH|HEIGHT) \d+", rb"\1 " + b"9" * 4000, pcd("binary").replace(b"POINTS 24\n", b""))
 FOUND: dict[str, tuple[str, str, str | bytes, str]] = {
     "a picture without a name": ("poses of nerfstudio", "a.json", frame(file_path="."), "has no file_path"),
     # a quarter of a megabyte took all memory of the machine
@@ -138,10 +140,7 @@ FOUND: dict[str, tuple[str, str, str | bytes, str]] = {
     "a count that cannot be printed": (
         "scan pcd binary",
         "a.pcd",
-        pcd("binary")
-        .replace(b"POINTS 24\n", b"")
-        .replace(b"WIDTH 24", b"WIDTH " + b"9" * 4000)
-        .replace(b"HEIGHT 1", b"HEIGHT " + b"9" * 4000),
+        LONG_COUNTS,
         "whole number of more than a hundred digits points",
     ),
     "points that unpack to gigabytes": (

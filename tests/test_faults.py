@@ -23,7 +23,6 @@ from edge_depth_nerf.scene.format import read_transforms
 POSE = np.eye(4).tolist()
 
 
-# ---- values ----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("value", "number"),
     [(1, 1.0), (-2.5, -2.5), (10**400, None), (True, None), ("1", None), (None, None), (float("nan"), None)],
@@ -64,9 +63,6 @@ def test_long_messages_keep_both_ends() -> None:
 def test_names_that_are_no_path_inside(tmp_path: Path, name: object) -> None:
     with pytest.raises(InputError, match=r"here is .*, expected the path of a file"):
         path_inside(tmp_path, name, "here")
-
-
-def test_names_inside(tmp_path: Path) -> None:
     assert path_inside(tmp_path, "é" * 127, "here") == tmp_path / ("é" * 127)
     assert path_inside(tmp_path, "a/../b", "here") == tmp_path / "a/../b"
 
@@ -80,18 +76,14 @@ def test_text_has_not_too_many_lines(tmp_path: Path, monkeypatch: pytest.MonkeyP
         list(text_lines(path))
 
 
-# ---- files -----------------------------------------------------------------------------------------------------
-def test_json_has_not_too_many_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_json_has_not_too_many_values_and_what_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.json"
     path.write_text("[1, 2, [3]]")
     assert read_json(path) == [1, 2, [3]]
     monkeypatch.setattr(files, "MAX_JSON_VALUES", 3)
     with pytest.raises(InputError, match="more than 3 values"):
         read_json(path)
-
-
-def test_json_that_is_to_be_an_object(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
+    monkeypatch.undo()
     write_json(path, {"a": 1})
     assert read_json_object(path, "a") == {"a": 1}
     with pytest.raises(InputError, match="has no 'b'"):
@@ -162,7 +154,7 @@ def test_windows_locks_a_file_beside_the_folder(tmp_path: Path, monkeypatch: pyt
         with only_writer(folder, console):
             began.set()
             assert list(folder.iterdir()) == [] and (tmp_path / ".scene.lock").is_file()
-            time.sleep(0.5)
+            time.sleep(0.1)
             order.append("first")
             (folder / "a").touch()
 
@@ -184,7 +176,6 @@ def test_windows_is_not_asked_whether_a_process_runs(tmp_path: Path, monkeypatch
         assert files._runs(os.getpid())
 
 
-# ---- transforms.json -------------------------------------------------------------------------------------------
 def transforms(frame: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
     return {"frames": [{"file_path": "a.png", "transform_matrix": POSE, **(frame or {})}], **more}
 
@@ -196,12 +187,10 @@ VIEW = {"camera": "a", "transform_matrix": POSE, "truth_rgb_file_path": "a", "tr
     ("content", "said"),
     [
         ([], "has no list of frames"),
-        ({"frames": []}, "has no list of frames"),
         ({"frames": [{}]}, "frame 0 has no file_path"),
         ({"frames": transforms()["frames"] * 2}, "frame 1: 'a.png' has a frame already"),
         (transforms({"transform_matrix": POSE[:3]}), "frame 0: transform_matrix must be 4×4 finite numbers"),
         (transforms({"transform_matrix": [[1e9] * 4] * 4}), "transform_matrix holds 1e.09, more than .* in metres"),
-        (transforms({"frame": True}), "frame is True, expected a frame number"),
         (transforms({"frame": 1.5}), "frame is 1.5, expected a frame number"),
         (transforms({"frame": -1}), "frame is -1, expected a frame number"),
         (transforms({"camera": "../a"}), "frame 0: camera is '../a'"),
@@ -209,21 +198,15 @@ VIEW = {"camera": "a", "transform_matrix": POSE, "truth_rgb_file_path": "a", "tr
         (transforms({"fl_x": "9"}), "frame 0: fl_x is '9', expected a number"),
         (transforms(cx=None), "cx is None, expected a number"),
         (transforms({"w": 7.5}), r"w and h are \[7.5\], expected whole numbers of pixels"),
-        (transforms(h=0), r"w and h are \[0.0\], expected whole numbers of pixels"),
         (transforms({"h": 10**6}, w=10**6), "frame 0: "),
         (transforms({"distortion_params": [0.0] * 5}), r"frame 0: distortion_params is \[.*expected 6 numbers"),
-        (transforms(distortion_params=[0.0, "a"] * 3), "distortion_params is .*expected 6 numbers"),
         (transforms(orientation_override="sideways"), "orientation_override is 'sideways', expected one of pca"),
         (transforms(applied_transform=[[0.0] * 4] * 2), "applied_transform must be 3×4 finite numbers"),
-        (transforms(applied_transform=[[0.0] * 3] * 4), "applied_transform must be 4×4 finite numbers"),
         (transforms(applied_scale=0), "applied_scale is 0, expected a number above"),
         (transforms(ply_file_path="/a"), "ply_file_path is '/a'"),
         (transforms(train_filenames="a.png"), "train_filenames is 'a.png', expected a list of file_paths"),
-        (transforms(test_filenames=[1]), r"test_filenames is \[1\], expected a list of file_paths"),
         (transforms(shifted_views=[]), "shifted_views are none"),
         (transforms(shifted_views={"far": [VIEW]}), "shifted_views are none"),
-        (transforms(shifted_views={"2000": [VIEW]}), "shifted_views are none"),
-        (transforms(shifted_views={"1": [{**VIEW, "camera": 1}]}), "shifted_views are none"),
         (transforms(shifted_views={"1": [{**VIEW, "transform_matrix": 1}]}), "1 m, view 0: transform_matrix must be"),
         (transforms(shifted_views={"1": [VIEW, {**VIEW, "truth_rgb_file_path": 1}]}), "view 1: truth_rgb_file_path"),
         (

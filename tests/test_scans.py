@@ -3,8 +3,11 @@
 import math
 import struct
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,18 +111,18 @@ def write_las(folder: Path, suffix: str = ".las") -> tuple[Path, ScanFormat]:
     return folder / f"a{suffix}", ScanFormat(names={"intensity": "strength"}, times=PointTimes("gps_time"))
 
 
-def write_laz(folder: Path) -> tuple[Path, ScanFormat]:
-    return write_las(folder, ".laz")
+def padded_pcd(path: Path, padding: tuple[int, int], record: list[tuple[str, str]]) -> tuple[Path, ScanFormat]:
+    """Padding under the name _, of `padding` values in two places."""
+    one, two = padding
+    header = f"VERSION .7\nFIELDS x y z _ intensity _ t\nSIZE 4 4 4 1 4 1 4\nCOUNT 1 1 1 {one} 1 {two} 1\n"
+    header += "TYPE F F F U F U U\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA binary\n"
+    path.write_bytes(header.encode() + records(record).tobytes())
+    return path, TIMED
 
 
 def write_empty_padding_pcd(folder: Path) -> tuple[Path, ScanFormat]:
     """What pcl_ros writes of clouds of Ouster, RoboSense and Velodyne: padding of no bytes."""
-    header = (
-        "VERSION 0.7\nFIELDS x y z _ intensity _ t\nSIZE 4 4 4 1 4 1 4\nTYPE F F F U F U U\nCOUNT 1 1 1 0 1 0 1\n"
-        "WIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA binary\n"
-    )
-    (folder / "a.pcd").write_bytes(header.encode() + records().tobytes())
-    return folder / "a.pcd", TIMED
+    return padded_pcd(folder / "a.pcd", (0, 0), RECORD)
 
 
 def write_compressed_pcd(folder: Path) -> tuple[Path, ScanFormat]:
@@ -130,13 +133,11 @@ def write_compressed_pcd(folder: Path) -> tuple[Path, ScanFormat]:
 
 def write_padded_pcd(folder: Path) -> tuple[Path, ScanFormat]:
     """What PCL writes of PointXYZI: padding under the name _, which takes several values."""
-    record = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("pad", "V4"), ("intensity", "<f4"), ("t", "<u4")]
-    header = (
-        "VERSION .7\nFIELDS x y z _ intensity t\nSIZE 4 4 4 1 4 4\nTYPE F F F U F U\nCOUNT 1 1 1 4 1 1\nWIDTH 3\n"
-        "HEIGHT 1\nPOINTS 3\nDATA binary\n"
-    )
-    (folder / "a.pcd").write_bytes(header.encode() + records(record).tobytes())
-    return folder / "a.pcd", TIMED
+    return padded_pcd(folder / "a.pcd", (4, 0), [*RECORD[:3], ("pad", "V4"), *RECORD[3:]])
+
+
+def of(form: Callable[..., Path], name: str, encoding: str, content: bytes) -> Any:
+    return pytest.param(lambda folder: (form(folder / name, encoding, content), TIMED), id=f"{name[2:]} {encoding}")
 
 
 @pytest.mark.parametrize(
@@ -148,28 +149,16 @@ def write_padded_pcd(folder: Path) -> tuple[Path, ScanFormat]:
         write_npz,
         write_lone_npz,
         write_feather,
-        pytest.param(lambda folder: (ply(folder / "a.ply", "ascii", lines()), TIMED), id="ply ascii"),
-        pytest.param(
-            lambda folder: (ply(folder / "a.ply", "binary_little_endian", records().tobytes()), TIMED), id="ply little"
-        ),
-        pytest.param(
-            lambda folder: (
-                ply(
-                    folder / "a.PLY",
-                    "binary_big_endian",
-                    records([(name, ">" + kind[1:]) for name, kind in RECORD]).tobytes(),
-                ),
-                TIMED,
-            ),
-            id="ply big",
-        ),
-        pytest.param(lambda folder: (pcd(folder / "a.pcd", "ascii", lines()), TIMED), id="pcd ascii"),
-        pytest.param(lambda folder: (pcd(folder / "a.pcd", "binary", records().tobytes()), TIMED), id="pcd binary"),
+        of(ply, "a.ply", "ascii", lines()),
+        of(ply, "a.ply", "binary_little_endian", records().tobytes()),
+        of(ply, "a.PLY", "binary_big_endian", records([(name, ">" + kind[1:]) for name, kind in RECORD]).tobytes()),
+        of(pcd, "a.pcd", "ascii", lines()),
+        of(pcd, "a.pcd", "binary", records().tobytes()),
         write_compressed_pcd,
         write_padded_pcd,
         write_empty_padding_pcd,
         write_las,
-        write_laz,
+        pytest.param(partial(write_las, suffix=".laz"), id="write_laz"),
     ],
 )
 def test_every_format_gives_the_same_points(tmp_path: Path, write) -> None:
@@ -207,13 +196,15 @@ def test_an_archive_says_what_it_lacks(tmp_path: Path) -> None:
         read_scan(damaged, scan)
 
 
-def test_tables_want_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.feather").write_bytes(b"ARROW1 and so on")
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(
-        InputError, match=r"a\.feather: .* pyarrow, which is not installed\. Run `pip install 'pyarrow<26'`"
-    ):
-        check_scan(tmp_path / "a.feather", ScanFormat())
+@pytest.mark.parametrize(
+    ("name", "package", "command"),
+    [("a.feather", "pyarrow", r"pip install 'pyarrow<26'"), ("a.laz", "laspy", r"pip install '\.\[las\]'")],
+)
+def test_some_formats_want_a_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name, package, command) -> None:
+    (tmp_path / name).write_bytes(b"ARROW1 and so on" if package == "pyarrow" else b"LASF")
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=rf"{name}: .* {package}, which is not installed\. Run `{command}`"):
+        check_scan(tmp_path / name, ScanFormat())
 
 
 def test_broken_tables_are_named(tmp_path: Path) -> None:
@@ -228,9 +219,9 @@ def test_broken_tables_are_named(tmp_path: Path) -> None:
         check_scan(path, replace(scan, names={"x": "X"}))
 
 
-@pytest.mark.parametrize("write", [write_las, write_laz])
-def test_broken_las_is_named(tmp_path: Path, write) -> None:
-    path, scan = write(tmp_path)
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_broken_las_is_named(tmp_path: Path, suffix: str) -> None:
+    path, scan = write_las(tmp_path, suffix)
     whole = path.read_bytes()
     for length in (20, 240, len(whole) - 3):
         path.write_bytes(whole[:length])
@@ -238,26 +229,18 @@ def test_broken_las_is_named(tmp_path: Path, write) -> None:
             read_scan(path, scan)
 
 
-def test_las_wants_laspy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.laz").write_bytes(b"LASF")
-    monkeypatch.setitem(sys.modules, "laspy", None)
-    with pytest.raises(InputError, match=r"a\.laz: .* laspy, which is not installed\. Run `pip install '\.\[las\]'`"):
-        check_scan(tmp_path / "a.laz", ScanFormat())
-
-
 def test_times_that_their_type_has_rounded_away(tmp_path: Path) -> None:
     """Seconds since 1970 in float32 step by 128 s; those of a turn are kept, and so are those since power-on."""
-    for begun_s, step in ((1_369_730_762.0, r"steps of 128 s: they are rounded away"), (3600.0, None)):
+    scan = ScanFormat(("x", "y", "z", "intensity", "t"), times=PointTimes("t", absolute=True))
+
+    def read_at(begun_s: float) -> Any:
         columns = np.column_stack((POINTS, INTENSITY, begun_s + COUNTS / 1e9)).astype(np.float32)
         np.save(tmp_path / "a.npy", columns)
-        scan = ScanFormat(("x", "y", "z", "intensity", "t"), times=PointTimes("t", absolute=True))
-        if step is None:
-            assert read_scan(tmp_path / "a.npy", scan, begun_s).offset_s is not None
-            continue
-        with pytest.raises(
-            InputError, match=rf"a\.npy: the points' times \(t, float32\).*{step}.*leave out point_times"
-        ):
-            read_scan(tmp_path / "a.npy", scan, begun_s)
+        return read_scan(tmp_path / "a.npy", scan, begun_s).offset_s
+
+    assert read_at(3600.0) is not None
+    with pytest.raises(InputError, match=r"times \(t, float32\).*steps of 128 s: they are rounded away.*leave out"):
+        read_at(1_369_730_762.0)
 
 
 def test_times_on_the_clock_keep_their_digits(tmp_path: Path) -> None:
@@ -283,7 +266,6 @@ def test_what_is_no_point_is_left_out_and_counted(tmp_path: Path) -> None:
     assert (found.not_finite, found.out_of_range) == (2, 3)
 
 
-# ---- broken files ----------------------------------------------------------------------------------------------
 def named(folder: Path, name: str, content: bytes) -> Path:
     (folder / name).write_bytes(content)
     return folder / name

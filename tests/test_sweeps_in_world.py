@@ -1,6 +1,5 @@
 """De-skewing, hidden points, free space and the sweeps around a picture, on scenes whose answer is known."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,11 +14,11 @@ from edge_depth_nerf.lidar import Sweep, SweepTiming, project_points
 from edge_depth_nerf.lidar.free_space import FreeSpace
 from edge_depth_nerf.lidar.sweeps import first_in_voxel
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.lidar.world import WorldSweep, above_field, sweep_in_world
+from edge_depth_nerf.lidar.world import above_field, sweep_in_world
 from edge_depth_nerf.process import sweep_store
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.recording import RecordedSweep, Recording
-from edge_depth_nerf.process.sweep_store import Surroundings, SweepStore, _Gathered, _Shared
+from edge_depth_nerf.process.sweep_store import SweepStore, _Gathered, _Shared
 
 FISHEYE = MEI(700, 700, 668.0, 668.0, 350.5, 349.0, 2.2134, 0.0168, 1.6549, 4e-4, 4e-4)
 
@@ -37,7 +36,6 @@ def straight(speed_m_s: float, seconds: int = 20) -> Trajectory:
     return Trajectory(times, poses)
 
 
-# ---- de-skewing ------------------------------------------------------------------------------------------------
 def measured_wall(speed_m_s: float, clockwise: bool, reference_rad: float) -> tuple[np.ndarray, np.ndarray]:
     """A wall at y = 10 m, measured by a scanner on the way: raw points, and where they really are."""
     azimuth = np.radians(np.linspace(20, 160, 400))
@@ -47,8 +45,7 @@ def measured_wall(speed_m_s: float, clockwise: bool, reference_rad: float) -> tu
     return raw, raw + speed_m_s * time_s[:, None] * [1, 0, 0]
 
 
-@pytest.mark.parametrize("clockwise", [True, False])
-@pytest.mark.parametrize("reference_rad", [0.0, np.pi, -1.2])
+@pytest.mark.parametrize(("clockwise", "reference_rad"), [(True, 0.0), (False, np.pi), (True, -1.2)])
 def test_points_go_where_they_were_measured(clockwise: bool, reference_rad: float) -> None:
     raw, true = measured_wall(10.0, clockwise, reference_rad)
     timing = SweepTiming(0.1, clockwise, reference_rad)
@@ -60,14 +57,12 @@ def test_points_go_where_they_were_measured(clockwise: bool, reference_rad: floa
     assert np.abs(true - raw).max() > 0.1
 
 
-def test_times_from_the_file_come_before_the_azimuth() -> None:
+def test_times_from_the_file_come_before_the_azimuth_and_the_scanners_place_counts() -> None:
     raw = np.array([[10.0, 0, 0], [10.0, 1, 0]])
     sweep = as_sweep(raw, torch.tensor([0.02, -0.03], dtype=torch.float64))
     found = sweep_in_world(sweep, 1.0, np.eye(4), straight(10.0), SweepTiming(0.1))
     np.testing.assert_allclose(found.points_m[:, 0].numpy(), [20.2, 19.7], atol=1e-9)
-
-
-def test_scanner_sits_where_it_sits() -> None:
+    # and the scanner sits where it sits
     scanner_to_vehicle = np.eye(4)
     scanner_to_vehicle[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     scanner_to_vehicle[:3, 3] = [1, 2, 3]
@@ -76,13 +71,12 @@ def test_scanner_sits_where_it_sits() -> None:
     np.testing.assert_allclose(found.world_to_scanner @ [1, 6, 3, 1], [4, 0, 0, 1], atol=1e-12)
 
 
-# ---- hidden points ---------------------------------------------------------------------------------------------
 def grid_on_plane(height: int, width: int, spacing_m: float, place: np.ndarray, across: np.ndarray, up: np.ndarray):
     a, b = np.meshgrid(np.arange(width) - width / 2, np.arange(height) - height / 2)
     return place + spacing_m * (a.reshape(-1, 1) * across + b.reshape(-1, 1) * up)
 
 
-@pytest.mark.parametrize("theta_deg", [0.0, 40.0, 80.0, 100.0])
+@pytest.mark.parametrize("theta_deg", [0.0, 80.0, 100.0])
 @pytest.mark.parametrize("camera", [FISHEYE, KannalaBrandt(700, 700, 215.0, 215.0, 350.0, 350.0, 0.0, 0.0, 0.0, 0.0)])
 def test_a_near_surface_hides_what_is_behind_also_beyond_90_degrees(camera: Camera, theta_deg: float) -> None:
     theta = np.radians(theta_deg)
@@ -160,7 +154,6 @@ def test_what_reaches_the_edge_of_the_field_goes_on_above_it() -> None:
     assert len(above_field(sweep, np.array([0.0, 0.5, -0.1]))[0]) == 0
 
 
-# ---- free space ------------------------------------------------------------------------------------------------
 def circle(range_m: float, rings: int = 40) -> np.ndarray:
     return range_m * beams(*np.meshgrid(np.radians(np.arange(0, 360, 0.2)), np.radians(np.linspace(-20, 2, rings))))
 
@@ -187,7 +180,6 @@ def test_the_edge_of_a_thing_is_not_seen_through() -> None:
     assert not free.seen_through(torch.from_numpy(shifted)).any()
 
 
-# ---- the sweeps around a picture -------------------------------------------------------------------------------
 def stored(worlds: dict[int, np.ndarray], speed_m_s: float = 0.0, interval_s: float = 0.1) -> list[RecordedSweep]:
     sweeps = []
     for frame, world in worlds.items():
@@ -209,7 +201,7 @@ BELOW = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -1], [0, 0, 0, 1]])
 def test_training_never_gets_a_sweep_that_is_held_out() -> None:
     sweeps = stored({frame: circle(20.0 + frame) for frame in range(24)})
     held_out = {4, 12, 20}
-    for reach in (0, 1, 3, 5):
+    for reach in (0, 3):
         found = store(sweeps, reach, held_out)
         for frame in range(24):
             used = {sweep.frame for sweep in found.used(frame, frame * 0.1)}
@@ -220,8 +212,7 @@ def test_training_never_gets_a_sweep_that_is_held_out() -> None:
                 assert used == expected - held_out
 
 
-@pytest.mark.parametrize("late_s", [0.0, 0.06])
-def test_a_passing_car_leaves_no_trail_but_stays_where_it_is(late_s: float) -> None:
+def test_a_passing_car_leaves_no_trail_but_stays_where_it_is() -> None:
     """A box of points drives through an otherwise still world, 1.2 m a frame.
 
     Sweeps whose poses are of their end are later than the picture that they belong to, by more than half a turn even.
@@ -235,20 +226,18 @@ def test_a_passing_car_leaves_no_trail_but_stays_where_it_is(late_s: float) -> N
         hidden = (bearing > at.min()) & (bearing < at.max()) & (wall[:, 2] < 0.6)
         worlds[frame], cars[frame] = np.concatenate((wall[~hidden], car)), car
     sweeps = store(stored(worlds), 3, set())
-    found = sweeps.around(3, 0.3 - late_s, BELOW)
-    near = found.points_m.norm(dim=-1) < 15
-    own = (found.age_s[near] - late_s).abs() < 1e-3
-    assert own.sum() == len(box), "its own moment's car is there"
-    assert (~own).sum() <= 0.02 * 6 * len(box), "what is left of the six other moments' cars"
-    assert len(found.points_m) > 6 * 0.9 * len(wall), "the wall stays"
+    for late_s in (0.0, 0.06):
+        found = sweeps.around(3, 0.3 - late_s, BELOW)
+        near = found.points_m.norm(dim=-1) < 15
+        own = (found.age_s[near] - late_s).abs() < 1e-3
+        assert own.sum() == len(box), "its own moment's car is there"
+        assert (~own).sum() <= 0.02 * 6 * len(box), "what is left of the six other moments' cars"
+        assert len(found.points_m) > 6 * 0.9 * len(wall), "the wall stays"
+        assert not found.moved[~near].any()
     # what lasts, over all pictures: next to nothing of seven cars
-    trails = sum(int((~f.moved & (f.points_m.norm(dim=-1) < 15)).sum()) for f in map(sweeps_of(sweeps), range(7)))
+    around = [sweeps.around(frame, frame * 0.1, BELOW) for frame in range(7)]
+    trails = sum(int((~each.moved & (each.points_m.norm(dim=-1) < 15)).sum()) for each in around)
     assert trails <= 0.05 * sum(min(frame + 3, 6) - max(frame - 3, 0) + 1 for frame in range(7)) * len(box)
-    assert not found.moved[~near].any()
-
-
-def sweeps_of(sweeps: SweepStore) -> Callable[[int], Surroundings]:
-    return lambda frame: sweeps.around(frame, frame * 0.1, BELOW)
 
 
 def test_points_above_the_own_sweeps_field_are_left_out() -> None:
@@ -310,6 +299,9 @@ def test_thinned_points_hide_as_much_as_before(monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_stray_point_is_not_the_edge_of_the_field() -> None:
     clean = sweep_in_world(as_sweep(circle(20.0)), 0.0, np.eye(4), straight(0.0), None)
+    # 40 beams over 22°, 0.2° between firings: the wider of the two gaps is 0.56°
+    assert clean.spacing_m.unique().numel() <= 3
+    assert np.degrees(float(clean.spacing_m[0]) / 20) == pytest.approx(0.5, abs=0.1)
     stray = np.concatenate((circle(20.0), [[5.0, 0, 3.0], [5.0, 0, -4.0]]))
     found = sweep_in_world(as_sweep(stray), 0.0, np.eye(4), straight(0.0), None)
     np.testing.assert_allclose(found.elevation_rad, clean.elevation_rad, atol=1e-3)
@@ -347,21 +339,3 @@ def test_threads_share_what_one_of_them_makes() -> None:
     for key in (3, 4, 5, 1):
         shared.get(key)
     assert made.count(1) == 2, "the oldest was forgotten"
-
-
-def test_broken_sweep_is_an_error_each_time() -> None:
-    def fails() -> Sweep:
-        raise OSError("gone")
-
-    sweeps = [replace(sweep, read=fails) for sweep in stored({0: circle(20.0)})]
-    found = store(sweeps, 0, set())
-    for _ in range(2):
-        with pytest.raises(OSError, match="gone"):
-            found.around(0, 0.0, AT_ORIGIN)
-
-
-def test_world_sweep_spacing_is_that_of_the_scanner() -> None:
-    """40 beams over 22°, 0.2° between firings: the wider of the two gaps is 0.56°."""
-    sweep: WorldSweep = sweep_in_world(as_sweep(circle(20.0)), 0.0, np.eye(4), straight(0.0), None)
-    assert sweep.spacing_m.unique().numel() <= 3
-    assert np.degrees(float(sweep.spacing_m[0]) / 20) == pytest.approx(0.5, abs=0.1)
