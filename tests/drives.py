@@ -10,11 +10,16 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from edge_depth_nerf.base.files import write_distance_png, write_mask, write_png
+from edge_depth_nerf.base.files import write_distance_png, write_json, write_mask, write_png
+from edge_depth_nerf.synthetic import render
+from edge_depth_nerf.synthetic.drive import synthesize_drive
+from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
 SEQUENCE = "2013_05_28_drive_0000_sync"
 FULL_SIZE = 1400
@@ -210,7 +215,6 @@ def write_room_drive(
     size: int = 70,
     cameras: tuple[str, ...] = ("image_02", "image_03"),
     aim: str | None = None,
-    space: str = " ",
     truth: bool = False,
     beams: int = 3000,
     seed: int = 0,
@@ -223,7 +227,6 @@ def write_room_drive(
         size: width and height of the pictures.
         cameras: which.
         aim: instead of evenly around the scanner, let each return lie somewhere in its own pixel of this camera.
-        space: what follows a colon in the YAML files.
         truth: also write the truth, and shifted views of frame 4.
         beams: returns of a sweep.
         seed: of the directions.
@@ -233,7 +236,7 @@ def write_room_drive(
     calibration = root / "calibration"
     calibration.mkdir(parents=True)
     for name in ("image_02", "image_03"):
-        (calibration / f"{name}.yaml").write_text(drive.camera(name).yaml(name, space))
+        (calibration / f"{name}.yaml").write_text(drive.camera(name).yaml(name))
     (calibration / "calib_cam_to_pose.txt").write_text("".join(f"{k}: {v}\n" for k, v in CAM_TO_POSE.items()))
     (calibration / "calib_cam_to_velo.txt").write_text(CAM0_TO_VELO + "\n")
 
@@ -285,8 +288,6 @@ def aimed_points(drive: RoomDrive, name: str, frame: int, rng: np.random.Generat
 
 
 def _write_shifted(drive: RoomDrive, cameras: tuple[str, ...]) -> None:
-    from edge_depth_nerf.base.files import write_json
-
     poses: dict[str, dict[str, dict[str, list]]] = {}
     for metres in (1, 2):
         for name in cameras:
@@ -299,6 +300,20 @@ def _write_shifted(drive: RoomDrive, cameras: tuple[str, ...]) -> None:
             write_distance_png(folder / "distance/0000000004.png", distance)
             write_png(folder / "rgb/0000000004.png", colours)
     write_json(drive.root / f"truth/{SEQUENCE}/shifted.json", poses)
+
+
+def synthesize_coarsely(options: SynthesizeOptions) -> Path:
+    """Render a drive with one ray a pixel instead of four, which is enough where only distances are looked at."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(render, "_SUBSAMPLES", ((0.0, 0.0),))
+        return synthesize_drive(options)
+
+
+def without_lidar_check(monkeypatch: Any) -> None:
+    """Let no converter hold LiDAR against the pictures, which takes long and is tested in test_process_warnings.py."""
+    from edge_depth_nerf.process import build, lidar_checks
+
+    monkeypatch.setattr(build, "check_lidar", lambda *_: lidar_checks.LidarCheck((), ()))
 
 
 def halve(path: Path) -> None:

@@ -25,6 +25,7 @@ from drives import (
     pose,
     spoil,
     wall_distance,
+    without_lidar_check,
     write_masks,
     write_mono,
     write_points,
@@ -56,14 +57,7 @@ from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.process import build
 from edge_depth_nerf.process.colmap import poses as colmap_poses
 from edge_depth_nerf.process.converters import convert
-from edge_depth_nerf.process.kitti360.calibration import (
-    read_cam_to_pose,
-    read_cam_to_velo,
-    read_mei_camera,
-    read_poses,
-    read_rig,
-    read_timestamps,
-)
+from edge_depth_nerf.process.kitti360.calibration import read_cam_to_pose, read_cam_to_velo, read_mei_camera, read_rig
 from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.scene.reader import read_scene
@@ -78,7 +72,8 @@ STEP_M = 1 / 256
 def process(drive: RoomDrive | Path, output: Path, **options: Any) -> ProcessReport:
     root = drive if isinstance(drive, Path) else drive.root
     console = options.pop("console", Console(quiet=True))
-    given = {"root": root, "sequence": SEQUENCE, "output": output, "sweeps": 0, "strict": True, "refine_poses": False}
+    given = {"root": root, "sequence": SEQUENCE, "output": output, "sweeps": 0, "strict": True}
+    given |= {"refine_poses": False, "find_ego": False}
     return convert(Kitti360Options(**given | options), console)
 
 
@@ -89,9 +84,14 @@ def refused(drive: RoomDrive, output: Path, message: str, **options: Any) -> Non
     assert not output.exists()
 
 
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_lidar_check(monkeypatch)
+
+
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
-    return write_room_drive(tmp_path_factory.mktemp("room") / "drive", truth=True)
+    return write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=6, truth=True, beams=4500)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,6 @@ def scene_camera(frame: dict[str, Any]) -> KannalaBrandt:
     return KannalaBrandt(frame["w"], frame["h"], *(frame[key] for key in keys))
 
 
-# ---- geometry --------------------------------------------------------------------------------------------------
 def test_lidar_is_at_the_walls_of_the_room(room: RoomDrive, scene: Path) -> None:
     found = maps(scene, "lidar_file_path")
     assert set(found) == {(name, frame) for name in CAMERAS for frame in room.frames}
@@ -173,10 +172,6 @@ def test_world_is_moved_near_the_cameras(room: RoomDrive, scene: Path) -> None:
     centres = np.array([frame["transform_matrix"] for frame in meta["frames"]])[:, :3, 3]
     assert np.abs(centres.mean(0)).max() <= 0.5
     assert meta["world_offset_m"] == [round(value) for value in meta["world_offset_m"]]
-    for frame in meta["frames"]:
-        expected = room.camera_to_world(frame["camera"], frame["frame"])
-        expected[:3, 3] -= meta["world_offset_m"]
-        np.testing.assert_allclose(frame["transform_matrix"], opencv_to_opengl(expected), atol=1e-9)
     # up stays up: the floor is below the cameras
     assert (centres[:, 2] + meta["world_offset_m"][2] > ROOM[0, 2]).all()
 
@@ -193,19 +188,6 @@ def test_cloud_lies_on_the_walls_in_their_colours(room: RoomDrive, scene: Path) 
     assert (colours == expected).all(-1).mean() > 0.9
 
 
-def test_cloud_has_nothing_of_held_out_frames(tmp_path: Path, drive: RoomDrive) -> None:
-    # only the sweep of frame 1, held out of every 2, reaches beyond the room
-    far = drive.points_m[1] * 3
-    write_points(drive.sweep(1), far)
-    process(drive, tmp_path / "scene", holdout_every=2)
-    meta = read_json(tmp_path / "scene/transforms.json")
-    assert {name[-14:-4] for name in meta["val_filenames"]} == {"0000000001"}
-    world = read_ply(tmp_path / "scene/points.ply")[0] + np.array(meta["world_offset_m"])
-    assert (world > ROOM[0] - 0.01).all() and (world < ROOM[1] + 0.01).all()
-    assert maps(tmp_path / "scene", "lidar_file_path")["image_02", 1].max() > 25
-
-
-# ---- sweeps ----------------------------------------------------------------------------------------------------
 def off_the_walls(drive: RoomDrive, scene: Path, slack: float = 0.0) -> np.ndarray:
     """How far each pixel's LiDAR distance is outside what the room's walls allow there, metres; all training maps."""
     # integer pixel centres: the pixel in column c covers u from c - 0.5 to c + 0.5
@@ -232,11 +214,11 @@ def test_training_maps_do_not_depend_on_held_out_sweeps(tmp_path: Path) -> None:
     """Another sweep at the frame held out: not a byte of what training reads changes."""
     scenes = []
     for nearer in (1.0, 0.5):
-        drive = write_room_drive(tmp_path / f"drive_{nearer}", beams=1000, size=48)
+        drive = write_room_drive(tmp_path / f"drive_{nearer}", frames=6, beams=500, size=32)
         write_points(drive.sweep(4), drive.as_measured(drive.points_m[4] * nearer, 4))
         scenes.append(tmp_path / f"scene_{nearer}")
         process(drive, scenes[-1], sweeps=3)
-    trained = [f"lidar/{name}/{frame:010d}.png" for name in CAMERAS for frame in (0, 1, 2, 3, 5, 6, 7, 8)]
+    trained = [f"lidar/{name}/{frame:010d}.png" for name in CAMERAS for frame in (0, 1, 2, 3, 5)]
     for file in ("points.ply", *trained):
         assert (scenes[0] / file).read_bytes() == (scenes[1] / file).read_bytes(), file
     held_out = [(scene / "lidar/image_02/0000000004.png").read_bytes() for scene in scenes]
@@ -277,9 +259,9 @@ def test_semantics_mask_what_may_move(drive: RoomDrive, tmp_path: Path) -> None:
 
 def test_vehicle_mask_is_found_corrected_and_kept(tmp_path: Path) -> None:
     """The drive is too short to find it: a mask without the vehicle is written, which a person then corrects."""
-    drive = write_room_drive(tmp_path / "drive", frames=3, beams=1000, size=48)
+    drive = write_room_drive(tmp_path / "drive", frames=3, beams=1000, size=32)
     for again in (False, True):
-        report = process(drive, tmp_path / "scene")
+        report = process(drive, tmp_path / "scene", find_ego=True)
         assert (report.written == 0) is again, "a mask that is looked for again is no other mask"
         (said,) = [notice for notice in report.notices if "nothing is masked as the vehicle" in notice]
         assert said.startswith("image_02, image_03: nothing is masked") and said.count("--ego-mask") == 1
@@ -289,22 +271,22 @@ def test_vehicle_mask_is_found_corrected_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "scene/ego_masks/image_02.png"
     mask = read_mask(path)
     before = (tmp_path / "scene/lidar/image_02/0000000000.png").read_bytes()
-    mask[26:] = False
+    mask[18:] = False
     write_mask(path, mask)
-    report = process(drive, tmp_path / "scene")
+    report = process(drive, tmp_path / "scene", find_ego=True)
     assert report.written >= 3, "that camera's pictures"
     assert vehicles_unknown(tmp_path / "scene") == ["image_03"]
     assert ["image_03: nothing is masked" in notice for notice in report.notices].count(True) == 1
-    assert not read_mask(tmp_path / "scene/masks/image_02.png")[26:].any()
+    assert not read_mask(tmp_path / "scene/masks/image_02.png")[18:].any()
     after = read_distance_png(tmp_path / "scene/lidar/image_02/0000000000.png")
-    assert not after[26:].any() and after[:26].any()
+    assert not after[18:].any() and after[:18].any()
     process(drive, tmp_path / "other", ego_mask=tmp_path / "scene/ego_masks")
     assert (tmp_path / "other/lidar/image_02/0000000000.png").read_bytes() != before
     assert (read_distance_png(tmp_path / "other/lidar/image_02/0000000000.png") == after).all()
 
 
 def test_the_vehicle_is_looked_for_in_training_pictures_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drive = write_room_drive(tmp_path / "drive", frames=9, beams=300, size=32)
+    drive = write_room_drive(tmp_path / "drive", frames=6, beams=300, size=32)
     looked: set[str] = set()
 
     def look(pictures: Any, lens: np.ndarray) -> NoEgo:
@@ -312,8 +294,8 @@ def test_the_vehicle_is_looked_for_in_training_pictures_alone(tmp_path: Path, mo
         return NoEgo("not looked for here")
 
     monkeypatch.setattr("edge_depth_nerf.process.vehicle.find_ego", look)
-    process(drive, tmp_path / "scene")
-    assert looked == {f"{frame:010d}.png" for frame in range(9) if frame != 4}
+    process(drive, tmp_path / "scene", find_ego=True)
+    assert looked == {f"{frame:010d}.png" for frame in range(6) if frame != 4}
 
 
 def found_by(options: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -338,8 +320,8 @@ def found_by(options: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_other_poses_found_make_other_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As if the search had been made anew: what was held out by the old poses is not by the new ones."""
-    drive = write_room_drive(tmp_path / "drive", frames=9, beams=300, size=32)
-    for scene, kept in (("scene", range(9)), ("scene", range(2, 9)), ("fresh", range(2, 9))):
+    drive = write_room_drive(tmp_path / "drive", frames=7, beams=300, size=32)
+    for scene, kept in (("scene", range(7)), ("scene", range(2, 7)), ("fresh", range(2, 7))):
         found_by({frame: 0.02 * len(kept) for frame in kept}, monkeypatch)
         process(drive, tmp_path / scene, poses="colmap", sweeps=1, ego_mask=write_masks(tmp_path / "ego", drive))
     meta = read_json(tmp_path / "scene/transforms.json")
@@ -348,22 +330,19 @@ def test_other_poses_found_make_other_maps(tmp_path: Path, monkeypatch: pytest.M
         assert (tmp_path / "scene" / name).read_bytes() == (tmp_path / "fresh" / name).read_bytes(), name
 
 
-def test_the_only_frame_is_without_a_sweep(drive: RoomDrive, tmp_path: Path) -> None:
+def test_a_single_frame_is_not_enough_for_everything(drive: RoomDrive, tmp_path: Path) -> None:
+    # a search that cannot begin leaves nothing behind
+    refused(drive, tmp_path / "scene", "2 pictures, expected 3 or more", poses="colmap", frames=1)
     cut(drive.sweep(drive.frames[0]))
     message = r"\.bin: .*expected a multiple of 16.*choose more by --frames"
     refused(drive, tmp_path / "scene", message, frames=1, strict=False)
 
 
-def test_a_search_that_cannot_begin_leaves_nothing_behind(drive: RoomDrive, tmp_path: Path) -> None:
-    refused(drive, tmp_path / "scene", "2 pictures, expected 3 or more", poses="colmap", frames=1)
-
-
-# ---- what the scene holds --------------------------------------------------------------------------------------
 def test_frames_split_masks_and_truth(room: RoomDrive, scene: Path) -> None:
     meta = read_json(scene / "transforms.json")
     assert meta["camera_model"] == "OPENCV_FISHEYE"
     assert meta["val_filenames"] == [f"images/{name}/0000000004.png" for name in CAMERAS]
-    assert len(meta["train_filenames"]) == 16
+    assert len(meta["train_filenames"]) == 10
     assert meta["source"]["sequence"] == SEQUENCE and meta["source"]["root"] == "drive"
     for frame in meta["frames"]:
         name, number = frame["camera"], frame["frame"]
@@ -407,10 +386,10 @@ def test_downscaled_scene_agrees_with_the_camera(room: RoomDrive, tmp_path: Path
     for name in CAMERAS:
         shutil.copytree(mono / name / "distance", mono_folder / name)
     ego = write_masks(tmp_path / "masks", room)
-    process(room, tmp_path / "scene", downscale=4, mono=mono_folder, ego_mask=ego, frames=6)
+    process(room, tmp_path / "scene", downscale=4, mono=mono_folder, ego_mask=ego, frames=2)
     meta = read_json(tmp_path / "scene/transforms.json")
     samples = np.stack(np.meshgrid(*[np.linspace(-2, 2, 9)] * 2), -1).reshape(-1, 2)
-    assert len(meta["frames"]) == 2 * 6
+    assert len(meta["frames"]) == 2 * 2
     for frame in meta["frames"]:
         name, number = frame["camera"], frame["frame"]
         # 70 = 17 · 4 + 2
@@ -455,18 +434,13 @@ def test_frame_masks_and_mono(drive: RoomDrive, tmp_path: Path) -> None:
         assert (read_distance_png(tmp_path / "scene" / frame["mono_file_path"]) == 3 + frame["frame"]).all()
     world = read_ply(tmp_path / "scene/points.ply")[0]
     assert 0 < len(world) < 3 * 600
+    assert calibrate_scene(tmp_path / "scene").everywhere, "maps that are brought count beyond LiDAR"
 
 
-def test_maps_that_are_brought_count_beyond_lidar(drive: RoomDrive, tmp_path: Path) -> None:
-    process(drive, tmp_path / "scene", mono=write_mono(tmp_path / "mono", drive, 3.0))
-    assert calibrate_scene(tmp_path / "scene").everywhere
-
-
-@pytest.mark.parametrize("sky", [True, False])
-def test_an_empty_monocular_map_is_named(sky: bool, drive: RoomDrive, tmp_path: Path) -> None:
+def test_an_empty_monocular_map_is_named(drive: RoomDrive, tmp_path: Path) -> None:
     write_mono(tmp_path / "mono", drive, lambda *picture: 0.0 if picture == ("image_03", 1) else 3.0)
     with pytest.raises(InputError, match=r"image_03/0000000001\.png: its monocular map contains no distance"):
-        process(drive, tmp_path / "scene", mono=tmp_path / "mono", sky=sky)
+        process(drive, tmp_path / "scene", mono=tmp_path / "mono")
     assert not (tmp_path / "scene/transforms.json").exists()
 
 
@@ -474,9 +448,8 @@ def test_one_ego_mask_for_both_cameras(drive: RoomDrive, tmp_path: Path) -> None
     keep = np.ones((32, 32), bool)
     keep[20:] = False
     write_mask(tmp_path / "ego.png", keep)
-    process(drive, tmp_path / "scene", ego_mask=tmp_path / "ego.png")
-    for name in CAMERAS:
-        assert not read_mask(tmp_path / f"scene/masks/{name}.png")[20:].any()
+    process(drive, tmp_path / "scene", ego_mask=tmp_path / "ego.png", frames=1)
+    assert not any(read_mask(tmp_path / f"scene/masks/{name}.png")[20:].any() for name in CAMERAS)
 
 
 def test_one_camera_alone(drive: RoomDrive, tmp_path: Path) -> None:
@@ -496,7 +469,6 @@ def test_points_that_are_none_are_counted(drive: RoomDrive, tmp_path: Path) -> N
     assert any(notice.startswith("7 LiDAR points were left out of 3 sweeps: zero") for notice in report.notices)
 
 
-# ---- choosing frames -------------------------------------------------------------------------------------------
 def test_frames_without_pose_sweep_or_picture_are_listed_and_skipped(tmp_path: Path) -> None:
     drive = write_room_drive(tmp_path / "drive", frames=12, beams=300, size=32)
     lines = drive.poses_file().read_text().splitlines(keepends=True)
@@ -523,14 +495,12 @@ def test_frames_without_pose_sweep_or_picture_are_listed_and_skipped(tmp_path: P
 
 
 def test_first_frames_and_stride(tmp_path: Path) -> None:
-    drive = write_room_drive(tmp_path / "drive", frames=12, beams=300, size=32, truth=True)
-    process(drive, tmp_path / "scene", first=2, frames=3, stride=4)
-    meta = read_json(tmp_path / "scene/transforms.json")
-    assert [frame["frame"] for frame in meta["frames"]] == [2, 6, 10, 2, 6, 10]
-    assert "shifted_views" not in meta, "those are of frame 4"
-    process(drive, tmp_path / "rest", first=3)
-    frames = read_json(tmp_path / "rest/transforms.json")["frames"]
-    assert [frame["frame"] for frame in frames[:9]] == list(range(3, 12))
+    drive = write_room_drive(tmp_path / "drive", frames=7, beams=300, size=32, truth=True)
+    for chosen, expected in (({"first": 1, "frames": 2, "stride": 4}, [1, 5]), ({"first": 3}, [3, 4, 5, 6])):
+        process(drive, tmp_path / str(len(expected)), **chosen)
+        meta = read_json(tmp_path / str(len(expected)) / "transforms.json")
+        assert [frame["frame"] for frame in meta["frames"]] == 2 * expected
+        assert "shifted_views" not in meta, "those are of frame 4, which is not held out"
 
 
 @pytest.mark.parametrize(
@@ -538,14 +508,10 @@ def test_first_frames_and_stride(tmp_path: Path) -> None:
     [
         ({"first": 3}, "--first 3: reaches frame 3, but the pictures .* are of frames 0 to 2"),
         ({"frames": 4}, "--first 0 --frames 4 --stride 1: reaches frame 3.*leave out --first and --frames"),
-        ({"frames": 2, "stride": 3}, "reaches frame 3"),
         ({"first": -1}, "--first -1: expected"),
-        ({"frames": 0}, "--frames 0: expected 1 or more"),
         ({"stride": 0}, "--stride 0: expected 1 or more"),
-        ({"downscale": 0}, "--downscale 0: expected 1 or more"),
         ({"downscale": 33}, "downscale factor 33: expected 1 to 32"),
         ({"holdout_every": 1}, "--holdout-every 1: expected 2 or more, or 0"),
-        ({"theta_max_deg": -5.0}, "--theta-max-deg -5.0: expected degrees"),
         ({"theta_max_deg": math.nan}, "--theta-max-deg nan: expected degrees"),
         ({"cameras": ()}, "--cameras : expected image_02, image_03 or both"),
         ({"cameras": ("image_00",)}, "--cameras image_00: expected image_02"),
@@ -556,7 +522,6 @@ def test_options_out_of_range(drive: RoomDrive, tmp_path: Path, options: dict[st
     refused(drive, tmp_path / "scene", message, **options)
 
 
-# ---- bad drives ------------------------------------------------------------------------------------------------
 YAML = "calibration/image_03.yaml"
 TO_POSE, TO_VELO = "calibration/calib_cam_to_pose.txt", "calibration/calib_cam_to_velo.txt"
 POSES = f"data_poses/{SEQUENCE}/poses.txt"
@@ -571,7 +536,6 @@ def _pose_line(frame: int) -> str:
 
 BROKEN: list[tuple[str, Change, str]] = [
     ("calibration", None, "drive/calibration: no such folder; .*drive holds data_2d_raw, data_3d_raw, data_poses"),
-    ("data_poses", None, "drive/data_poses: no such folder"),
     (
         f"data_poses/{SEQUENCE}",
         lambda path: path.rename(path.with_name("2013_05_28_drive_0002_sync")),
@@ -590,7 +554,6 @@ BROKEN: list[tuple[str, Change, str]] = [
         *(POSES, _pose_line(70).encode()),
         "none of frames 0 to 2 can be used: no pose: 0-2. .*has poses of frames 70 to 70, .*sweeps of frames 0 to 2",
     ),
-    (YAML, None, r"image_03\.yaml: no such file"),
     (YAML, b"", r"image_03\.yaml: nothing in it"),
     (YAML, b"\x93\xff\x00", r"image_03\.yaml: not a text file"),
     (YAML, ("(?s)   p1:.*", ""), r"image_03\.yaml: ends after line 11 without distortion_parameters\.p1"),
@@ -598,19 +561,14 @@ BROKEN: list[tuple[str, Change, str]] = [
     (YAML, ("u0: ", "u0: about "), r"image_03\.yaml, line 17: .*u0 is not a number"),
     (YAML, ("k2:", "k2"), r"image_03\.yaml, line 11: Missing ':'"),
     (YAML, ("MEI", "PINHOLE"), r"image_03\.yaml, line 3: model_type is not MEI"),
-    (YAML, ("gamma1: ", "gamma1: -"), r"image_03\.yaml: MEI camera: fx"),
     (TO_POSE, None, r"calib_cam_to_pose\.txt: no such file"),
     (TO_POSE, (r" \S+\n\Z", ""), r"calib_cam_to_pose\.txt, line 3: 11 numbers, expected 12"),
     (TO_POSE, ("image_02:.*\n", ""), r"calib_cam_to_pose\.txt: has no line for image_02, only for image_00, image_03"),
     (TO_POSE, ("image_02:", ""), "line 2: expected 'image_00: ' and"),
     (TO_POSE, (r"-0\.0307524527", "O.0307"), r"calib_cam_to_pose\.txt, line 2: 'O\.0307' is not a finite number"),
     (TO_POSE, (r"0\.9995185086", "0.9895185086"), r"calib_cam_to_pose\.txt, line 2: not a rotation"),
-    (TO_VELO, None, r"calib_cam_to_velo\.txt: no such file"),
     (TO_VELO, b"", r"calib_cam_to_velo\.txt: 0 lines with text, expected one"),
-    (TO_VELO, f"{CAM0_TO_VELO} 0 0 0 1\n".encode(), r"calib_cam_to_velo\.txt, line 1: 16 numbers, expected 12"),
-    (POSES, None, r"poses\.txt: no such file"),
     (POSES, b"\n", r"poses\.txt: no poses in it"),
-    (POSES, (r"( \S+){3}\n\Z", ""), r"poses\.txt, line 3: 9 numbers, expected 12"),
     (POSES, (r" \S+\n\Z", " nan\n"), r"poses\.txt, line 3: 'nan' is not a finite number"),
     (POSES, (r"\Z", _pose_line(1)), r"poses\.txt, line 4: frame 1 has a pose already"),
     (POSES, ("^0 ", "1.5 "), r"poses\.txt, line 1: '1\.5' is not a frame number"),
@@ -619,9 +577,7 @@ BROKEN: list[tuple[str, Change, str]] = [
     (TIMES, (r"2013-05-28 08:46:00\.1", "yesterday "), r"image_03/timestamps\.txt, line 2: 'yesterday .*is not a time"),
     (TIMES, (r"\S+\n\Z", "08:46:00.0\n"), r"timestamps\.txt, line 3: not after the line before"),
     (f"{SWEEPS}/0000000001.bin", cut, r"0000000001\.bin: 4797 bytes, expected a multiple of 16"),
-    (f"{SWEEPS}/0000000002.bin", b"", r"0000000002\.bin: 0 bytes"),
     (PICTURE, halve, r"image_03/data_rgb/0000000001\.png: truncated"),
-    (PICTURE, b"", r"0000000001\.png: not a PNG \(0 bytes\)"),
     (
         *(PICTURE, lambda path: write_png(path, np.zeros((32, 31, 3), np.uint8))),
         r"0000000001\.png: 31×32 pixels, but its camera's calibration says 32×32",
@@ -729,7 +685,6 @@ def test_missing_timestamps_are_no_obstacle(drive: RoomDrive, tmp_path: Path) ->
     assert [f["camera"] for f in meta["frames"] if "timestamp_s" not in f] == ["image_03"] * 3
 
 
-# ---- run again -------------------------------------------------------------------------------------------------
 def test_other_options_or_other_input_are_another_scene(drive: RoomDrive, tmp_path: Path) -> None:
     process(drive, tmp_path / "scene")
     before = tree(tmp_path / "scene")
@@ -743,34 +698,11 @@ def test_other_options_or_other_input_are_another_scene(drive: RoomDrive, tmp_pa
     assert tree(tmp_path / "scene") == before
 
 
-# ---- KITTI-360's files -----------------------------------------------------------------------------------------
-def test_yaml_without_spaces_after_the_colon(tmp_path: Path) -> None:
-    drive = write_room_drive(tmp_path / "drive", frames=1, beams=300, size=32, space="")
-    twin = drive.camera("image_02")
-    assert "xi:2.2134" in (drive.root / "calibration/image_02.yaml").read_text()
-    camera = read_mei_camera(drive.root / "calibration/image_02.yaml")
+def test_yaml_without_spaces_after_the_colon(drive: RoomDrive, tmp_path: Path) -> None:
+    twin, path = drive.camera("image_02"), tmp_path / "image_02.yaml"
+    path.write_text(twin.yaml("image_02", space=""))
     numbers = (twin.gamma1, twin.gamma2, twin.u0 + 0.5, twin.v0 + 0.5, twin.xi, twin.k1, twin.k2, twin.p1, twin.p2)
-    assert camera == MEI(32, 32, *numbers)
-
-
-def test_chain_of_frames(drive: RoomDrive) -> None:
-    rig = read_rig(drive.root / "calibration", CAMERAS)
-    cam0_to_pose, cam0_to_velo = matrix(CAM_TO_POSE["image_00"]), matrix(CAM0_TO_VELO)
-    for name in CAMERAS:
-        # velo → camera 0 → vehicle → camera k
-        chain = np.linalg.inv(matrix(CAM_TO_POSE[name])) @ cam0_to_pose @ np.linalg.inv(cam0_to_velo)
-        found = np.linalg.inv(rig.camera_to_pose[name]) @ rig.velo_to_pose
-        np.testing.assert_allclose(found, chain, atol=1e-12)
-    # the scanner's axes in the vehicle: x forward stays, y left and z up become right and down
-    np.testing.assert_allclose(rig.velo_to_pose[:3, :3], np.diag([1, -1, -1]), atol=0.02)
-
-
-def test_timestamps_keep_fractions_of_a_microsecond(tmp_path: Path) -> None:
-    path = tmp_path / "timestamps.txt"
-    path.write_text("1970-01-02 00:00:01.123456789\n1970-01-02 00:00:02\n\n")
-    first, second = read_timestamps(path)
-    assert first == pytest.approx(86401.123456789, abs=1e-9)
-    assert second == 86402.0
+    assert read_mei_camera(path) == MEI(32, 32, *numbers)
 
 
 def test_real_calibration(real_data: Path) -> None:
@@ -782,14 +714,6 @@ def test_real_calibration(real_data: Path) -> None:
     for name, numbers in CAM_TO_POSE.items():
         assert np.array_equal(poses[name], matrix(numbers))
     assert np.array_equal(read_cam_to_velo(folder / "calib_cam_to_velo.txt"), matrix(CAM0_TO_VELO))
-
-
-def test_poses_skip_frames(tmp_path: Path) -> None:
-    path = tmp_path / "poses.txt"
-    path.write_text(_pose_line(3) + "\n" + _pose_line(11).replace("11 ", "1.1e1   ", 1))
-    assert {frame: found.tolist() for frame, found in read_poses(path).items()} == {
-        frame: pose(0).tolist() for frame in (3, 11)
-    }
 
 
 def test_report_says_how_well_the_cameras_fit(drive: RoomDrive, tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drives import Change, cut, spoil
+from bad_input import recording
+from drives import Change, spoil, synthesize_coarsely, without_lidar_check
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 from trainings import train
@@ -24,7 +25,6 @@ from edge_depth_nerf.process.options import RigOptions
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.rig import read_rig_recording
 from edge_depth_nerf.process.rig_file import read_rig
-from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
 pytestmark = pytest.mark.slow
@@ -40,10 +40,15 @@ def example() -> str:
     return next(block for block in re.findall(r"```toml\n(.*?)```", PAGE.read_text(), re.S) if "[lidars.roof]" in block)
 
 
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_lidar_check(monkeypatch)
+
+
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("rig") / "drive"
-    synthesize_drive(SynthesizeOptions(root, "parking", frames=FRAMES, size=128, layout="rig"))
+    synthesize_coarsely(SynthesizeOptions(root, "parking", frames=FRAMES, size=128, layout="rig"))
     written, page = root / "rig.toml", root.parent / "page.toml"
     page.write_text(example())
     for ours, theirs in zip(read_rig(page, root).cameras, read_rig(written, root).cameras, strict=True):
@@ -60,7 +65,7 @@ def mine(drive: Path, tmp_path: Path) -> Path:
 
 def options(root: Path, **changes) -> RigOptions:
     given = {"root": root, "output": root.parent / "scene", "theta_max_deg": 110.0, "strict": True}
-    return RigOptions(**{**given, "refine_poses": False, **changes})
+    return RigOptions(**{**given, "refine_poses": False, "find_ego": False, **changes})
 
 
 def read(root: Path, **changes) -> Recording:
@@ -77,10 +82,9 @@ def edit(root: Path, *changes: tuple[str, str], file: str = "rig.toml") -> Path:
     return root
 
 
-# ---- the whole way ---------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def scene(drive: Path) -> Path:
-    report = convert(options(drive, refine_poses=True), Console(quiet=True))
+    report = convert(options(drive, refine_poses=True, find_ego=True), Console(quiet=True))
     assert (report.training, report.held_out) == (12, 3)
     assert report.skipped == ()
     assert sorted(report.fits) == ["front", "left", "right"]
@@ -94,6 +98,8 @@ def test_the_pages_example_is_a_scene(scene: Path) -> None:
     assert meta["source"]["kind"] == "rig" and "/" not in json.dumps(meta["source"])
     sizes = {frame["camera"]: (frame["w"], frame["h"]) for frame in meta["frames"]}
     assert sizes == {"left": (128, 128), "right": (128, 128), "front": (128, 96)}
+    times = {frame["frame"]: frame["timestamp_s"] for frame in meta["frames"]}
+    assert [times[number] - times[0] for number in range(FRAMES)] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4], abs=0.02)
     # the lenses see past 95 degrees, and the masks keep it
     assert read_mask(scene / "masks/left.png").mean() > 0.5
 
@@ -121,7 +127,6 @@ def test_the_pages_example_trains(scene: Path, tmp_path: Path) -> None:
     assert np.isfinite(metrics["masked_psnr"]) and metrics["lidar_pixels"] > 100
 
 
-# ---- reading ---------------------------------------------------------------------------------------------------
 def test_cameras_are_read_as_the_page_says(drive: Path) -> None:
     rig = read_rig(drive / "rig.toml", drive)
     left, right, front = (camera.camera for camera in rig.cameras)
@@ -144,16 +149,13 @@ def test_json_says_the_same(mine: Path) -> None:
     assert [sweep.time_s for sweep in of_json.sweeps] == [sweep.time_s for sweep in of_toml.sweeps]
 
 
-@pytest.mark.parametrize(("centre", "cx"), [("0", 64.896), ("0.5", 64.396), ("1", 63.896)])
-def test_pixel_centres(mine: Path, centre: str, cx: float) -> None:
-    edit(mine, ("cx = 64.396", f"pixel_centre = {centre}\ncx = 64.396"))
-    assert read_rig(mine / "rig.toml", mine).cameras[0].camera.cx == pytest.approx(cx)
-
-
-def test_a_camera_ends_where_its_calibration_does(mine: Path) -> None:
-    edit(mine, ('model = "mei"', 'model = "mei"\ntheta_max_deg = 80'))
-    cameras = read(mine).cameras
-    assert [math.degrees(camera.camera.theta_max_rad) for camera in cameras][1] == pytest.approx(80)
+def test_pixel_centres_and_where_a_calibration_ends(mine: Path) -> None:
+    edit(mine, ('model = "mei"', 'model = "mei"\ntheta_max_deg = 80'), ("cx = 64.396", "pixel_centre = 0\ncx = 64.396"))
+    for centre, after, cx in (("0", "0.5", 64.896), ("0.5", "1", 64.396), ("1", "1", 63.896)):
+        left, right, _ = read_rig(mine / "rig.toml", mine).cameras
+        assert left.camera.cx == pytest.approx(cx)
+        assert math.degrees(right.camera.theta_max_rad) == pytest.approx(80)
+        edit(mine, (f"pixel_centre = {centre}\ncx", f"pixel_centre = {after}\ncx"))
 
 
 def test_frames_and_scans(mine: Path) -> None:
@@ -230,21 +232,15 @@ def test_points_in_the_vehicles_frame(mine: Path) -> None:
     in_vehicle = read(mine).sweeps[1]
     # the scanner stays where it is, and the numbers of the file are the vehicle's
     assert np.array_equal(in_vehicle.to_vehicle, in_scanner.to_vehicle)
-    moved = in_vehicle.read().points_m.numpy() @ in_vehicle.to_vehicle[:3, :3].T + in_vehicle.to_vehicle[:3, 3]
+    points, place = in_vehicle.read(), in_vehicle.to_vehicle[:3, 3]
+    moved = points.points_m.numpy() @ in_vehicle.to_vehicle[:3, :3].T + place
     assert moved == pytest.approx(in_scanner.read().points_m.numpy(), abs=1e-9)
-
-
-def test_missing_echoes_in_the_vehicles_frame_are_no_points(mine: Path) -> None:
-    """A recorder that moves the whole cloud moves them to the scanner's place."""
-    edit(mine, ('timestamp = "start"', 'timestamp = "start"\npoints_in = "vehicle"'))
-    sweep = read(mine).sweeps[1]
-    points = sweep.read()
-    place = sweep.to_vehicle[:3, 3]
-    lines = sweep.path.read_bytes().partition(b"DATA binary\n")
+    # missing echoes are no points: a recorder that moves the whole cloud moves them to the scanner's place
+    lines = in_vehicle.path.read_bytes().partition(b"DATA binary\n")
     values = np.frombuffer(lines[2], RECORD).copy()
     for name, number in zip("xyz", place, strict=True):
         values[name][:7] = number
-    sweep.path.write_bytes(lines[0] + lines[1] + values.tobytes())
+    in_vehicle.path.write_bytes(lines[0] + lines[1] + values.tobytes())
     without = read(mine).sweeps[1].read()
     assert without.out_of_range == points.out_of_range + 7
     assert len(without.points_m) == len(points.points_m) - 7 and without.points_m.norm(dim=-1).min() > 0.5
@@ -369,7 +365,7 @@ def test_a_frame_between_scans_is_a_picture_without_lidar(mine: Path, holdout: i
     scans = sorted((mine / "lidar").iterdir())
     for scan in scans[1::2]:
         scan.unlink()
-    convert(options(mine, holdout_every=holdout))
+    convert(options(mine, cameras=("front",), holdout_every=holdout))
     said = " ".join(capsys.readouterr().out.split())
     meta = read_json(mine.parent / "scene" / "transforms.json")
     has_lidar = {
@@ -378,7 +374,7 @@ def test_a_frame_between_scans_is_a_picture_without_lidar(mine: Path, holdout: i
     }
     without = {number for number, has in has_lidar.items() if not has}
     assert without == ({1, 3} if holdout else set())
-    assert ("No LiDAR point in 6 pictures" in said) is bool(holdout)
+    assert ("No LiDAR point in 2 pictures" in said) is bool(holdout)
 
 
 @pytest.mark.parametrize(
@@ -390,20 +386,12 @@ def test_a_frame_between_scans_is_a_picture_without_lidar(mine: Path, holdout: i
         (1, 8, "take a longer stretch"),
     ],
 )
-def test_a_drive_too_short_to_hold_one_out_is_told_how(
-    mine: Path, capsys, frames: int, every: int, advice: str | None
-) -> None:
-    convert(options(mine, cameras=("front",), frames=frames, holdout_every=every, sweeps=0))
+def test_a_drive_too_short_to_hold_one_out_is_told_how(tmp_path: Path, capsys, frames, every, advice) -> None:
+    recording(tmp_path)
+    convert(options(tmp_path, output=tmp_path / "scene", frames=frames, holdout_every=every, sweeps=0, strict=False))
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("No frame is held out") == (advice is not None)
     assert advice is None or advice in said
-
-
-def test_times_of_the_pictures_reach_the_scene(scene: Path) -> None:
-    times = {frame["frame"]: frame["timestamp_s"] for frame in read_json(scene / "transforms.json")["frames"]}
-    assert [times[number] - times[0] for number in range(FRAMES)] == pytest.approx(
-        [0.1 * number for number in range(FRAMES)], abs=0.02
-    )
 
 
 def test_some_cameras_and_some_frames(mine: Path) -> None:
@@ -461,25 +449,15 @@ def test_options_bring_masks_and_monocular_maps(mine: Path) -> None:
 def test_a_rendered_drive_brings_its_truth(mine: Path, drive: Path) -> None:
     """As the generator writes it: true distances and clean pictures reach the scene, to evaluate on."""
     shutil.copytree(drive / "truth", mine / "truth")
-    edit(
-        mine,
-        *(
-            (f"[cameras.{name}]\n", f"[cameras.{name}]\n{keys}")
-            for name in ("left", "right", "front")
-            for keys in [f'truth_distance = "truth/{name}/distance"\ntruth_rgb = "truth/{name}/rgb"\n']
-        ),
-    )
+    for name in ("left", "right", "front"):
+        keys = f'truth_distance = "truth/{name}/distance"\ntruth_rgb = "truth/{name}/rgb"\n'
+        edit(mine, (f"[cameras.{name}]\n", f"[cameras.{name}]\n{keys}"))
     report = convert(options(mine, frames=2, holdout_every=2), Console(quiet=True))
     for frame in read_json(report.scene / "transforms.json")["frames"]:
         name, number = frame["camera"], frame["frame"]
-        truth = mine / f"truth/{name}/distance/{number:06d}.png"
-        assert np.array_equal(
-            read_distance_png(report.scene / frame["truth_distance_file_path"]), read_distance_png(truth)
-        )
-        assert np.array_equal(
-            read_image(report.scene / frame["truth_rgb_file_path"]),
-            read_image(mine / f"truth/{name}/rgb/{number:06d}.png"),
-        )
+        for kind, read_map in (("distance", read_distance_png), ("rgb", read_image)):
+            found = read_map(report.scene / frame[f"truth_{kind}_file_path"])
+            assert np.array_equal(found, read_map(mine / f"truth/{name}/{kind}/{number:06d}.png"))
     eight_bits = mine / "truth/left/distance/000001.png"
     write_png(eight_bits, np.zeros((128, 128), np.uint8))
     with pytest.raises(InputError, match=r"left/distance/000001\.png: expected a 16-bit grey PNG"):
@@ -489,17 +467,10 @@ def test_a_rendered_drive_brings_its_truth(mine: Path, drive: Path) -> None:
         read(mine)
 
 
-@pytest.mark.parametrize("key", ["mono", "truth_rgb"])
-def test_maps_of_some_cameras_alone(mine: Path, drive: Path, key: str) -> None:
+def test_maps_of_some_cameras_alone(mine: Path) -> None:
     """All that is taken has them, or nothing; before anything is made."""
-    shutil.copytree(drive / "truth", mine / "truth")
-    edit(
-        mine,
-        ('mono = "mono/right"\n', "")
-        if key == "mono"
-        else ("[cameras.left]\n", '[cameras.left]\ntruth_rgb = "truth/left/rgb"\n'),
-    )
-    with pytest.raises(InputError, match=rf"rig\.toml: cameras\.right\.{key} is missing; give it for every camera"):
+    edit(mine, ('mono = "mono/right"\n', ""))
+    with pytest.raises(InputError, match=r"rig\.toml: cameras\.right\.mono is missing; give it for every camera"):
         read(mine)
     assert len(read(mine, cameras=("left",)).pictures) == FRAMES
 
@@ -534,7 +505,6 @@ def test_z_depth_maps_in_place_of_lidar(mine: Path, drive: Path) -> None:
         assert np.median(np.abs(distance[both] - truth[both])) < 0.004
 
 
-# ---- what is wrong is said -------------------------------------------------------------------------------------
 LEFT = '[cameras.left]\nimages = "images/left"'
 
 
@@ -542,10 +512,7 @@ LEFT = '[cameras.left]\nimages = "images/left"'
     ("old", "new", "message"),
     [
         ("fx = 33.9625035468\n", "", r"rig\.toml: cameras\.left\.fx is missing; expected a number above 0"),
-        ("fx = 33.9625035468", "fx = '33.9'", r"cameras\.left\.fx is '33\.9', expected a number above 0"),
         ("fx = 33.9625035468", "fx = 0", r"cameras\.left\.fx is 0, expected a number above 0"),
-        ("fx = 33.9625035468", "fx = true", r"cameras\.left\.fx is True, expected a number"),
-        ("fx = 33.9625035468", "fx = nan", r"cameras\.left\.fx is nan, expected a number"),
         ("fx = 33.9625035468", "fxx = 33.9", r"cameras\.left\.fx is missing.*There is fxx: is fx meant"),
         ("cx = 64.396", "cx = 643.96", r"cameras\.left\.cx is 643\.96, expected a pixel within the picture, 0 to 128"),
         ("width = 128", "width = 128.5", r"cameras\.left\.width is 128\.5, expected a whole number from 1"),
@@ -554,7 +521,6 @@ LEFT = '[cameras.left]\nimages = "images/left"'
         ("k4 = 8e-05", "xi = 1.2", r"left\.xi: unknown key; a camera of model kannala-brandt has k1, k2, k3, k4"),
         ("k4 = 8e-05", "pixel_centre = 0.25", r"cameras\.left\.pixel_centre is 0\.25, expected one of 0, 0\.5, 1"),
         ('model = "pinhole"', 'model = "fisheye"', r"cameras\.front\.model is 'fisheye', expected one of 'mei'"),
-        ("xi = 1.2\n", "", r"cameras\.right\.xi is missing"),
         ("xi = 1.2", "xi = -1.2", r"cameras\.right\.model: MEI camera: xi is -1\.2, expected more than -1"),
         ('times_file = "times_left.txt"', "", r"cameras\.left\.times_file: expected one of .*found none"),
         ('times_file = "times_left.txt"', 'times_file = "t"\nrate_hz = 10', "found times_file and rate_hz"),
@@ -565,14 +531,12 @@ LEFT = '[cameras.left]\nimages = "images/left"'
         ("turn_s = 0.1", 'turn_s = 0.1\ndirection = "clockwise"', r"roof\.direction: points with times of their"),
         ('column = "t", unit', 'column = "t", units', r"lidars\.roof\.point_times\.units: unknown key; Is unit meant"),
         ("-0.9902680687", "0.9902680687", r"cameras\.left\.to_vehicle: not a rotation and a translation"),
-        ("0.0348994967", "0.5", r"cameras\.left\.to_vehicle: not a rotation"),
         ("[0.0, -0.9902680687, -0.139173101, 1.07],", "", r"left\.to_vehicle: not a rotation and a translation"),
         ("quaternion = [0.0, 0.0,", "quaternion = [0.0, 1.0,", r"roof\.to_vehicle: the quaternion .* length 1\.41"),
         ("translation = [0.8, 0.02, 0.84]", "translation = [0.8]", r"translation is \[0\.8\], expected 3 num"),
         ('format = "tum"', 'format = "tum"\nrate_hz = 10', r"poses\.rate_hz: unknown key; poses of format tum bring"),
         ('format = "tum"', 'format = "tum2"', r"poses\.format is 'tum2', expected one of 'tum', 'kitti'"),
         ('format = "tum"', 'format = "tum"\nof = "roo"', r"poses\.of is 'roo', expected one of 'vehicle', 'left'"),
-        ('format = "tum"', 'format = "kitti"\nrate_hz = 10', r"line 2: 8 numbers as TUM's format has, expected 12"),
         ("[poses]", "[pose]", r"rig\.toml: pose: unknown key; Is poses meant\?"),
         ("[lidars.roof]", "[lidars.left]", "left is the name of both a camera and a scanner"),
         ("[cameras.left]", "[cameras.'a/b']", r"cameras\.a/b: a sensor's name is letters"),
@@ -612,18 +576,11 @@ def test_a_wrong_rig_file_is_named(mine: Path, old: str, new: str, message: str)
         ),
         ("poses.txt", b"5 0 0 0 0 0 0 1\n6 0 0 0 0 0 0 1\n", "left and the poses do not"),
         ("poses.txt", b"5 0 0 0 0 0 0 1\n", r"poses\.txt: 1 pose, expected at least two"),
-        ("poses.txt", b"# nothing\n", r"poses\.txt: 0 poses, expected at least two"),
         ("poses.txt", None, r"poses\.txt: no such file"),
         ("times_left.txt", b"1\n2\n", "times_left.txt: 2 times, but .*left has 5 files"),
         ("times_left.txt", b"1\n1\n1\n1\n1\n", r"000001\.png and 000000\.png have the same time, 1\.0"),
         ("images/left/000002.png", b"no", r"left/000002\.png: not a PNG"),
         ("mono/left/000002.png", None, r"mono/left/000002\.png: no such file; cameras\.left\.mono"),
-        (
-            *("mono/left/000002.png", lambda path: write_png(path, np.zeros((128, 128), np.uint8))),
-            "expected a 16-bit grey PNG",
-        ),
-        ("lidar/*", b"", r"\.pcd: an empty file, expected a scan"),
-        ("lidar/*", cut, r"\.pcd: .* the file is truncated"),
         (
             *("lidar/*", lambda path: path.write_bytes(re.sub(rb"(WIDTH|POINTS) \d+", rb"\1 0", path.read_bytes()))),
             r"\.pcd: a scan without points",
@@ -646,11 +603,7 @@ def test_a_scan_of_nan_is_an_error_when_it_is_read(mine: Path) -> None:
     nothing = struct.pack("<ffffI", math.nan, math.nan, math.nan, 0, 0)
     path.write_bytes(head + b"DATA binary\n" + nothing * (len(points) // len(nothing)))
     with pytest.raises(InputError, match=rf"{path.name}: none of its \d+ points can be used"):
-        convert(options(mine, cameras=("front",), sweeps=0), Console(quiet=True))
-    # some NaN among the points are left out and counted
-    path.write_bytes(head + b"DATA binary\n" + nothing * 7 + points[7 * len(nothing) :])
-    report = convert(options(mine, cameras=("front",), sweeps=0), Console(quiet=True))
-    assert any(notice.startswith("7 LiDAR points were left out") for notice in report.notices)
+        convert(options(mine, cameras=("front",), frames=2, sweeps=0), Console(quiet=True))
 
 
 @pytest.mark.parametrize(
@@ -658,8 +611,6 @@ def test_a_scan_of_nan_is_an_error_when_it_is_read(mine: Path) -> None:
     [
         ({"cameras": ("middle",)}, r"--cameras middle: .* no such camera, only left, right, front"),
         ({"first": 9}, "--first 9: reaches frame 9, but the recording has frames 0 to 4"),
-        ({"frames": 9}, "--first 0 --frames 9 --stride 1: reaches frame 8"),
-        ({"stride": 0}, "--stride 0"),
         ({"root": Path("nowhere")}, "nowhere: no such folder"),
         ({"rig": Path("nowhere.toml")}, r"nowhere\.toml: no such file"),
     ],
