@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from edge_depth_nerf.base.files import read_distance_png, read_json
+from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import RigOptions
 from edge_depth_nerf.process.rig import read_rig_recording
@@ -47,14 +47,7 @@ def test_lidar_lies_on_the_walls(rig: Path, tmp_path: Path) -> None:
     assert not any("points of a scan get one time" in notice for notice in report.notices)
     cameras = {frame["camera"] for frame in read_json(report.scene / "transforms.json")["frames"]}
     assert len(cameras) == 2
-    for camera, truth in zip(sorted(cameras), ("front", "side"), strict=True):
-        for number in range(data_sets.FRAMES):
-            lidar = read_distance_png(report.scene / f"lidar/{camera}/{number:010d}.png")
-            there = lidar > 0
-            assert there.mean() > 0.1
-            errors = (lidar / data_sets.true_distance(truth, number) - 1)[there]
-            # a return lies anywhere in its pixel, 1.1° wide, and the floor is flat: on the whole that cancels
-            assert abs(np.median(errors)) < 0.002 and np.mean(np.abs(errors) < 0.04) > 0.9
+    data_sets.check_walls(report.scene, dict(zip(sorted(cameras), ("front", "side"), strict=True)))
 
 
 def test_each_reading_has_its_own_pose(rig: Path, tmp_path: Path) -> None:
