@@ -1,11 +1,14 @@
 """`process` as a whole: scene, monocular maps and their calibration by one command, each done once."""
 
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from drives import SEQUENCE, RoomDrive, write_mono, write_room_drive
+from drives import SEQUENCE, RoomDrive, without_lidar_check, write_mono, write_room_drive
 from rich.console import Console
 from scenes import transforms
 
@@ -23,19 +26,24 @@ from edge_depth_nerf.scene.reader import read_scene
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(autouse=True)
-def small_network(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="module")
+def small_network() -> Iterator[None]:
     small = PresetValues((8, 16, 24), 64, TrainingOptions(steps=12, batch=2, evaluate_every=6))
-    monkeypatch.setitem(estimate.PRESETS, "lite", small)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(estimate.PRESETS, "lite", small)
+        without_lidar_check(patch)
+        yield
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
-    return write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=6, size=64)
+    return write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=6, size=64, cameras=("image_02",))
 
 
 def options_of(room: RoomDrive, output: Path, **changes: Any) -> Kitti360Options:
-    return Kitti360Options(root=room.root, sequence=SEQUENCE, output=output, sweeps=1, find_ego=False, **changes)
+    given: dict[str, Any] = {"cameras": ("image_02",), "sweeps": 1, "find_ego": False, "refine_poses": False}
+    given["motion"] = False
+    return Kitti360Options(root=room.root, sequence=SEQUENCE, output=output, **given | changes)
 
 
 def run(options: Kitti360Options) -> str:
@@ -45,16 +53,33 @@ def run(options: Kitti360Options) -> str:
     return said.get()
 
 
+@pytest.fixture(scope="module")
+def done(room: RoomDrive) -> tuple[Path, str]:
+    """What one command makes of the drive, and what it says."""
+    scene = room.root.parent / "done"
+    return scene, run(options_of(room, scene))
+
+
+@pytest.fixture
+def scene(done: tuple[Path, str], tmp_path: Path) -> Path:
+    return Path(shutil.copytree(done[0], tmp_path / "scene"))
+
+
+@pytest.fixture(scope="module")
+def without_maps(room: RoomDrive) -> Path:
+    scene = room.root.parent / "without_maps"
+    run(options_of(room, scene, estimate_depth=False))
+    return scene
+
+
 def dates(scene: Path) -> dict[str, int]:
     return {str(path.relative_to(scene)): path.stat().st_mtime_ns for path in scene.rglob("*") if path.is_file()}
 
 
-def test_one_command_gives_lidar_mono_and_its_calibration(room: RoomDrive, tmp_path: Path) -> None:
-    scene = tmp_path / "scene"
-    said = run(options_of(room, scene))
+def test_one_command_gives_lidar_mono_and_its_calibration(room: RoomDrive, done: tuple[Path, str], scene: Path) -> None:
     meta = read_json(scene / "transforms.json")
     assert meta["mono"]["kind"] == "network" and meta["mono"]["trained_on"] == "scene"
-    assert len(meta["frames"]) == 12
+    assert len(meta["frames"]) == 6
     for frame in meta["frames"]:
         mono = read_distance_png(scene / frame["mono_file_path"])
         assert mono.shape == (64, 64) and (mono > 0).mean() > 0.2
@@ -62,9 +87,9 @@ def test_one_command_gives_lidar_mono_and_its_calibration(room: RoomDrive, tmp_p
     trained = meta["mono"]["trained_frames"]
     assert trained and not any("0000000004" in name for name in trained)
     calibration = read_calibration(scene / CALIBRATION_FILE)
-    assert calibration.error_model is not None and len(calibration.frames) == 10
+    assert calibration.error_model is not None and len(calibration.frames) == 5
     assert (scene / WEIGHTS).is_file()
-    assert "12 pictures got a monocular map" in said
+    assert "6 pictures got a monocular map" in done[1]
 
     before = dates(scene)
     transforms = (scene / "transforms.json").read_bytes()
@@ -75,56 +100,47 @@ def test_one_command_gives_lidar_mono_and_its_calibration(room: RoomDrive, tmp_p
     assert not {name for name in changed if name.startswith(("mono/", "lidar/")) or name in (WEIGHTS, CALIBRATION_FILE)}
 
 
-@pytest.mark.parametrize("stage", ["estimate_depth", "calibrate_scene"])
 def test_a_run_stopped_between_its_stages_is_finished(
-    stage: str, room: RoomDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    room: RoomDrive, without_maps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    scene = tmp_path / "scene"
-    with monkeypatch.context() as patch:
-        patch.setattr(estimate, stage, stop)
-        with pytest.raises(KeyboardInterrupt):
-            run(options_of(room, scene))
-    assert not (scene / CALIBRATION_FILE).exists()
+    scene = Path(shutil.copytree(without_maps, tmp_path / "scene"))
+    for stage, has_mono in (("estimate_depth", False), ("calibrate_scene", True)):
+        with monkeypatch.context() as patch:
+            patch.setattr(estimate, stage, stop)
+            with pytest.raises(KeyboardInterrupt):
+                run(options_of(room, scene))
+        assert not (scene / CALIBRATION_FILE).exists() and read_scene(scene).has("mono") == has_mono
     said = run(options_of(room, scene))
     assert (scene / CALIBRATION_FILE).is_file() and read_scene(scene).has("mono")
-    assert ("Trained" in said) == (stage == "estimate_depth")
+    assert "Trained" not in said
 
 
-def test_maps_that_came_later_stay(room: RoomDrive, tmp_path: Path) -> None:
-    scene = tmp_path / "scene"
-    run(options_of(room, scene, estimate_depth=False))
-    assert not read_scene(scene).has("mono")
+def test_maps_that_came_later_stay(room: RoomDrive, without_maps: Path, tmp_path: Path) -> None:
+    assert not read_scene(without_maps).has("mono")
+    scene = Path(shutil.copytree(without_maps, tmp_path / "scene"))
     put_in(scene, 3.0)
     said = run(options_of(room, scene))
     assert "Train" not in said
-    meta = read_json(scene / "transforms.json")
-    assert meta["mono"] == {"trained_on": "elsewhere"}
-    assert set(np.unique(read_distance_png(scene / meta["frames"][0]["mono_file_path"]))) == {0.0, 3.0}
+    assert read_json(scene / "transforms.json")["mono"] == {"trained_on": "elsewhere"}
+    assert distances(scene) == {3.0}
     # these are calibrated, too
     assert read_calibration(scene / CALIBRATION_FILE).everywhere
 
 
-def test_maps_of_pictures_that_have_changed_are_made_anew(room: RoomDrive, tmp_path: Path) -> None:
-    drive = write_room_drive(tmp_path / "drive", frames=6, size=64)
-    scene = tmp_path / "scene"
-    run(options_of(drive, scene))
+def test_maps_of_pictures_that_have_changed_are_made_anew(room: RoomDrive, scene: Path, tmp_path: Path) -> None:
+    drive = replace(room, root=shutil.copytree(room.root, tmp_path / "drive"))
+    assert "monocular map" not in run(options_of(drive, scene))
     for picture in drive.root.rglob("0000000002.png"):
         picture.touch()
-    assert "12 pictures got a monocular map" in run(options_of(drive, scene))
-
-
-def test_maps_that_are_given_are_calibrated(room: RoomDrive, tmp_path: Path) -> None:
-    said = run(options_of(room, tmp_path / "scene", mono=write_mono(tmp_path / "mono", room, 4.0)))
-    assert read_calibration(tmp_path / "scene" / CALIBRATION_FILE).error_model is not None
-    assert not (tmp_path / "scene" / WEIGHTS).exists() and "Error of the monocular maps" in said
+    assert "6 pictures got a monocular map" in run(options_of(drive, scene))
 
 
 def test_without_lidar_it_says_what_to_do(room: RoomDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = tmp_path / "scene"
-    report = process(options_of(room, scene, estimate_depth=False), Console(quiet=True))
+    report = process(options_of(room, scene, estimate_depth=False, frames=2), Console(quiet=True))
     with transforms(scene) as meta:
         for frame in meta["frames"]:
             del frame["lidar_file_path"], frame["depth_file_path"]
@@ -144,28 +160,13 @@ def distances(scene: Path) -> set[float]:
     return {float(value) for f in frames for value in np.unique(read_distance_png(scene / f["mono_file_path"]))} - {0.0}
 
 
-def test_maps_put_in_over_those_of_the_drive_stay_with_their_source(tmp_path: Path) -> None:
-    drive = write_room_drive(tmp_path / "drive", frames=6, size=64)
-    scene, mono = tmp_path / "scene", write_mono(tmp_path / "mono", drive, 9.0)
-    options = options_of(drive, scene, mono=mono, sky=False)
-    run(options)
+def test_maps_that_are_brought_stay_until_others_are_put_in_whole(room: RoomDrive, tmp_path: Path) -> None:
+    scene, mono = tmp_path / "scene", write_mono(tmp_path / "mono", room, 9.0)
+    options = options_of(room, scene, mono=mono, sky=False)
+    assert "Error of the monocular maps" in run(options)
     assert distances(scene) == {9.0} and "mono" not in read_json(scene / "transforms.json")
-    put_in(scene, 3.0)
-    run(options)
-    assert distances(scene) == {3.0}
-    assert read_json(scene / "transforms.json")["mono"] == {"trained_on": "elsewhere"}
-    # one file renewed: all are the drive's again, none is mixed in
-    next(mono.rglob("0000000002.png")).touch()
-    assert "of this scene are removed" in run(options)
-    assert distances(scene) == {9.0} and "mono" not in read_json(scene / "transforms.json")
-
-
-def test_maps_that_were_being_put_in_are_not_taken_for_the_drives(tmp_path: Path) -> None:
-    drive = write_room_drive(tmp_path / "drive", frames=6, size=64)
-    scene = tmp_path / "scene"
-    options = options_of(drive, scene, mono=write_mono(tmp_path / "mono", drive, 9.0), sky=False)
-    run(options)
-    # killed while the new maps were moved in
+    assert read_calibration(scene / CALIBRATION_FILE).error_model is not None and not (scene / WEIGHTS).exists()
+    # killed while new maps were moved in: these are not taken for the drive's
     meta = read_json(scene / "transforms.json")
     write_distance_png(scene / meta["frames"][0]["mono_file_path"], np.full((64, 64), 5.0))
     for frame in meta["frames"]:
@@ -174,18 +175,25 @@ def test_maps_that_were_being_put_in_are_not_taken_for_the_drives(tmp_path: Path
     assert not read_scene(scene).has("mono")
     run(options)
     assert distances(scene) == {9.0}
+    # put in over those of the drive, they stay with their source
+    put_in(scene, 3.0)
+    run(options)
+    assert distances(scene) == {3.0}
+    assert read_json(scene / "transforms.json")["mono"] == {"trained_on": "elsewhere"}
+    # one file renewed: all are the drive's again, none is mixed in
+    (mono / "image_02/0000000002.png").touch()
+    assert "of this scene are removed" in run(options)
+    assert distances(scene) == {9.0} and "mono" not in read_json(scene / "transforms.json")
 
 
-def test_a_map_that_is_lost_is_made_again(room: RoomDrive, tmp_path: Path) -> None:
-    scene = tmp_path / "scene"
-    run(options_of(room, scene))
+def test_a_map_that_is_lost_is_made_again(room: RoomDrive, scene: Path) -> None:
     next((scene / "mono").rglob("*.png")).unlink()
     said = run(options_of(room, scene))
     assert "of this scene are removed" in said and "is trained already" in said
     assert read_scene(scene).has("mono") and (scene / CALIBRATION_FILE).is_file()
 
 
-def test_options_that_come_too_late_are_told(room: RoomDrive, tmp_path: Path) -> None:
-    run(options_of(room, tmp_path / "scene", motion=True))
-    said = run(options_of(room, tmp_path / "scene", motion=False))
+def test_options_that_come_too_late_are_told(room: RoomDrive, scene: Path) -> None:
+    run(options_of(room, scene, motion=True))
+    said = run(options_of(room, scene, motion=False))
     assert "has distances from motion already, which are kept and used" in said
