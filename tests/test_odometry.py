@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from drives import synthesize_coarsely, without_lidar_check
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
@@ -25,12 +26,12 @@ from edge_depth_nerf.poses.path_agreement import PATHS_AGREE, compare_paths, rea
 from edge_depth_nerf.process import pose_checks
 from edge_depth_nerf.process.build import process_recording
 from edge_depth_nerf.process.converters import read_drive
-from edge_depth_nerf.process.lidar_poses import check_sweeps, lidar_poses
+from edge_depth_nerf.process.lidar_poses import check_sweeps, lidar_poses, path_of
 from edge_depth_nerf.process.options import JbnuDepth360Options, Kitti360Options, ProcessOptions, RigOptions
 from edge_depth_nerf.process.pose_checks import lidar_says
 from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.scene.reader import read_scene
-from edge_depth_nerf.synthetic.drive import synthesize_drive
+from edge_depth_nerf.synthetic.layout import DriveLayout
 from edge_depth_nerf.synthetic.lidar import Scanner, sweep
 from edge_depth_nerf.synthetic.motion import Drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
@@ -109,7 +110,6 @@ def errors(path: Trajectory, poses: Poses) -> tuple[np.ndarray, np.ndarray, floa
     return apart, np.linalg.norm((steps - expected)[:, :3, 3], axis=-1), float(length_m)
 
 
-# ---- the path --------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 @pytest.mark.parametrize("motion", ["drive", "bends"])
 def test_the_path_is_right_from_the_first_step(motion):
@@ -140,10 +140,10 @@ def test_the_path_is_right_from_the_first_step(motion):
 def test_the_same_sweeps_give_the_same_path():
     pytest.importorskip("kiss_icp")
     recording, _ = scanned("street", FRAMES)
-    sweeps = [TimedSweep(s.time_s, functools.partial(points_of, s)) for s in recording.sweeps[:8]]
+    sweeps = [TimedSweep(s.time_s, functools.partial(points_of, s)) for s in recording.sweeps[:6]]
     steps: list[int] = []
     first = odometry(sweeps, lambda: steps.append(1))
-    assert len(steps) == steps_of(8)
+    assert len(steps) == steps_of(6)
     np.testing.assert_array_equal(first.vehicle_to_world, odometry(sweeps).vehicle_to_world)
 
 
@@ -155,10 +155,10 @@ def points_of(recorded: RecordedSweep) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scene", "kept", "share"), [("street", 10, 0.01), ("street", 5, 0.02)])
-def test_few_sweeps_are_enough(scene, kept, share):
+@pytest.mark.parametrize(("kept", "share"), [(10, 0.01), (5, 0.02)])
+def test_few_sweeps_are_enough(kept, share):
     pytest.importorskip("kiss_icp")
-    recording, poses = scanned(scene, FRAMES)
+    recording, poses = scanned("street", FRAMES)
     few = dataclasses.replace(recording, sweeps=recording.sweeps[:kept], pictures=recording.pictures[:kept])
     found = lidar_poses(few, OPTIONS, QUIET)
     assert found.trajectory is not None
@@ -187,13 +187,15 @@ def test_pictures_away_from_the_sweeps_are_listed():
     assert found.skipped[-1].frame == FRAMES - 1 and found.skipped[-1].reason == "no sweep near it in time"
 
 
-# ---- the whole way ---------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module", params=["kitti-360", "rig", "jbnu-depth360"])
 def blind(request, tmp_path_factory) -> ProcessOptions:
     """Options for a rendered drive whose poses are taken away; every second frame is asked for."""
     pytest.importorskip("kiss_icp")
     root = tmp_path_factory.mktemp("odometry") / "drive"
-    synthesize_drive(SynthesizeOptions(root, "parking", frames=7, size=64, layout=request.param))
+    with pytest.MonkeyPatch.context() as patch:
+        # KITTI-360's own scanner measures four times as many points
+        patch.setattr(DriveLayout, "scanner", Scanner.turning(2.0, -24.8, 64, 450, VELO_TO_POSE))
+        synthesize_coarsely(SynthesizeOptions(root, "parking", frames=5, size=64, layout=request.param))
     for path in (*root.rglob("poses.txt"), *root.rglob("cam0_to_world.txt")):
         path.unlink()
     for path in root.glob("*.toml"):
@@ -209,20 +211,20 @@ def blind(request, tmp_path_factory) -> ProcessOptions:
 
 
 @pytest.mark.slow
-def test_a_drive_without_poses_becomes_a_scene(blind):
+def test_a_drive_without_poses_becomes_a_scene(blind, monkeypatch):
+    without_lidar_check(monkeypatch)
     report = process_recording(read_drive(blind), blind, QUIET)
     notices = " ".join(report.notices)
-    # every sweep is followed, not only those of the frames asked for: 0.6 s at some 4 m/s
-    length = re.search(r"followed 7 sweeps of \w+: the path is ([0-9.]+) m long", notices)
-    assert length is not None and 2.2 < float(length[1]) < 2.7
+    # every sweep is followed, not only those of the frames asked for: 0.4 s at some 4 m/s
+    length = re.search(r"followed 5 sweeps of \w+: the path is ([0-9.]+) m long", notices)
+    assert length is not None and 1.47 < float(length[1]) < 1.8
     assert "epipolar curves" in notices or "Too few features match" in notices
     assert not report.skipped
     scene = read_scene(blind.output)
-    assert len(scene.frames()) == 4
+    assert len(scene.frames()) == 3
     assert scene.has("lidar")
 
 
-# ---- how far two paths agree -----------------------------------------------------------------------------------
 def test_paths_are_compared_in_any_world(tmp_path):
     first = driven(np.full(30, 8.0), np.linspace(0, 0.5, 30), 0.1)
     world = np.eye(4)
@@ -256,6 +258,8 @@ def test_a_path_from_pictures_is_held_against_lidar(tmp_path, monkeypatch):
     recording, poses = scanned("street", FRAMES)
     times = np.array([sweep.time_s for sweep in recording.sweeps])
     true = Trajectory(times, poses(times))
+    path = path_of(check_sweeps(recording), QUIET)
+    monkeypatch.setattr(pose_checks, "path_of", lambda *_: path)
     said = lidar_says(dataclasses.replace(recording, trajectory=true), tmp_path, QUIET)
     found = read_agreement(tmp_path)
     assert found is not None and found.max_m < 0.1 and found.scale == pytest.approx(1, abs=0.01)
@@ -273,7 +277,6 @@ def test_a_path_from_pictures_is_held_against_lidar(tmp_path, monkeypatch):
     assert lidar_says(dataclasses.replace(recording, trajectory=true, sweeps=()), tmp_path / "other", QUIET) == []
 
 
-# ---- what it cannot do -----------------------------------------------------------------------------------------
 @pytest.mark.slow
 @pytest.mark.parametrize(("motion", "message"), [("stands", "stands still"), ("turns", r"turns on the spot, by \d+°")])
 def test_a_vehicle_that_goes_nowhere_has_no_path(motion, message):
@@ -325,7 +328,6 @@ def test_the_scanner_with_most_points_is_followed():
     assert [sweep.time_s for sweep in followed] == times
 
 
-# ---- paths that no vehicle drives ------------------------------------------------------------------------------
 def driven(speed_m_s: np.ndarray, course_rad: np.ndarray, interval_s: float) -> Trajectory:
     ahead = np.stack((np.cos(course_rad), np.sin(course_rad), 0 * course_rad), -1)
     poses = np.tile(np.eye(4), (len(speed_m_s), 1, 1))
@@ -334,7 +336,7 @@ def driven(speed_m_s: np.ndarray, course_rad: np.ndarray, interval_s: float) -> 
     return Trajectory(interval_s * np.arange(len(speed_m_s)), poses)
 
 
-@pytest.mark.parametrize("interval_s", [0.05, 0.1, 0.5, 1.0])
+@pytest.mark.parametrize("interval_s", [0.05, 1.0])
 def test_what_a_car_does_is_no_break(interval_s):
     time = np.arange(0, 12, interval_s)
     hard = np.clip(25 - 8 * np.maximum(time - 3, 0), 0, None)  # full braking
