@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from drives import without_lidar_check
 from rich.console import Console
 from scenes import tree as files_of
 
@@ -18,32 +19,38 @@ from edge_depth_nerf.synthetic import layout as layout_module
 from edge_depth_nerf.synthetic import lidar, rig
 from edge_depth_nerf.synthetic.drive import WORLD_ORIGIN_M, _Kitti360, _manifest, synthesize_drive
 from edge_depth_nerf.synthetic.layout import simulated_estimate
-from edge_depth_nerf.synthetic.materials import Material, Noise
+from edge_depth_nerf.synthetic.materials import Material
 from edge_depth_nerf.synthetic.motion import Drive, Route, Turn, WindingRoute
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 from edge_depth_nerf.synthetic.render import Caster, World
-from edge_depth_nerf.synthetic.scenes import ISLAND_M, _movers, build_scene, roundabout_route
+from edge_depth_nerf.synthetic.scenes import ISLAND_M, build_scene, roundabout_route
 from edge_depth_nerf.synthetic.traffic import traffic
 
 pytestmark = pytest.mark.slow
 
 SEQUENCE = SynthesizeOptions.sequence
+SWEEPS = f"data_3d_raw/{SEQUENCE}/velodyne_points"
 FRAMES = 5
 SIZE = 128
 
 
-@pytest.fixture(scope="module")
-def street_model():
-    return build_scene(SynthesizeOptions(Path(), "street", frames=FRAMES))
-
-
-@pytest.fixture(scope="module")
-def street(tmp_path_factory, street_model):
-    options = SynthesizeOptions(tmp_path_factory.mktemp("street") / "drive", "street", frames=FRAMES, size=SIZE)
+def drive_in(world: World, options: SynthesizeOptions) -> Path:
+    """The drive through a scene that is built already."""
     with pytest.MonkeyPatch.context() as patch:
-        # the same scene, not built twice
-        patch.setattr(layout_module, "build_scene", lambda _: street_model)
-        return options, synthesize_drive(options)
+        patch.setattr(layout_module, "build_scene", lambda _: world.model)
+        patch.setattr(layout_module, "World", lambda *_: world)
+        return synthesize_drive(options)
+
+
+@pytest.fixture(scope="module")
+def street_world():
+    return World(build_scene(SynthesizeOptions(Path(), "street", frames=FRAMES)), 0)
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory, street_world):
+    options = SynthesizeOptions(tmp_path_factory.mktemp("street") / "drive", "street", frames=FRAMES, size=SIZE)
+    return options, drive_in(street_world, options)
 
 
 @pytest.fixture(scope="module")
@@ -55,16 +62,9 @@ def parking(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def roundabout(tmp_path_factory):
-    options = SynthesizeOptions(tmp_path_factory.mktemp("roundabout") / "drive", "roundabout", frames=2, size=SIZE)
-    model = build_scene(options)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(layout_module, "build_scene", lambda _: model)
-        return model, Caster(model.static), synthesize_drive(options)
-
-
-@pytest.fixture(scope="module")
-def street_world(street_model):
-    return street_model, World(street_model, 0)
+    options = SynthesizeOptions(tmp_path_factory.mktemp("roundabout") / "drive", "roundabout", frames=1, size=SIZE)
+    world = World(build_scene(options), 0)
+    return world, drive_in(world, options)
 
 
 def poses_of(root: Path) -> np.ndarray:
@@ -84,37 +84,27 @@ def picture(root: Path, camera: str, frame: int) -> np.ndarray:
 
 
 def points_of(root: Path, frame: int, folder: str = "truth") -> np.ndarray:
-    where = {"truth": f"truth/{SEQUENCE}/points", "raw": f"data_3d_raw/{SEQUENCE}/velodyne_points/data"}[folder]
+    where = {"truth": f"truth/{SEQUENCE}/points", "raw": f"{SWEEPS}/data"}[folder]
     return np.fromfile(root / where / f"{frame:010d}.bin", "<f4").reshape(-1, 4).astype(np.float64)
 
 
-# ------------------------------------------------------------------------------------------------- layout
 def test_layout_is_complete(street):
     _, root = street
-    expected = {
-        *("drive.json", f"truth/{SEQUENCE}/shifted.json"),
-        f"data_3d_raw/{SEQUENCE}/velodyne_points/timestamps.txt",
-    }
     calibration = ("image_02.yaml", "image_03.yaml", "calib_cam_to_pose.txt", "calib_cam_to_velo.txt")
+    expected = {"drive.json", f"truth/{SEQUENCE}/shifted.json", f"{SWEEPS}/timestamps.txt"}
     expected |= {f"calibration/{name}" for name in calibration}
     expected |= {f"data_poses/{SEQUENCE}/{name}.txt" for name in ("poses", "cam0_to_world")}
     for camera in ("image_02", "image_03"):
+        mine = f"truth/{SEQUENCE}/{camera}"
         expected |= {f"data_2d_raw/{SEQUENCE}/{camera}/timestamps.txt"}
         expected |= {f"truth/masks/{camera}{kind}.png" for kind in ("", "_lens", "_ego")}
         for frame in range(FRAMES):
-            expected |= {
-                f"data_2d_raw/{SEQUENCE}/{camera}/data_rgb/{frame:010d}.png",
-                f"truth/{SEQUENCE}/{camera}/distance/{frame:010d}.png",
-                f"truth/{SEQUENCE}/{camera}/rgb/{frame:010d}.png",
-                f"simulated_mono/{SEQUENCE}/{camera}/{frame:010d}.png",
-                f"data_3d_raw/{SEQUENCE}/velodyne_points/data/{frame:010d}.bin",
-                f"truth/{SEQUENCE}/points/{frame:010d}.bin",
-            }
-        expected |= {
-            f"truth/{SEQUENCE}/{camera}/shifted_{shift}m/{kind}/{4:010d}.png"
-            for shift in (1, 2)
-            for kind in ("rgb", "distance")
-        }
+            expected |= {f"{mine}/{kind}/{frame:010d}.png" for kind in ("distance", "rgb")}
+            expected |= {f"{folder}/{frame:010d}.bin" for folder in (f"{SWEEPS}/data", f"truth/{SEQUENCE}/points")}
+            for folder in (f"data_2d_raw/{SEQUENCE}/{camera}/data_rgb", f"simulated_mono/{SEQUENCE}/{camera}"):
+                expected.add(f"{folder}/{frame:010d}.png")
+        kinds = [f"shifted_{shift}m/{kind}" for shift in (1, 2) for kind in ("rgb", "distance")]
+        expected |= {f"{mine}/{kind}/{4:010d}.png" for kind in kinds}
     assert set(files_of(root)) == expected
 
 
@@ -151,6 +141,11 @@ def test_poses_and_timestamps(street):
     # z points down, the pose's origin is 0.93 m above the road
     assert np.all(poses[:, 2, 2] < -0.99)
     np.testing.assert_allclose(poses[:, 2, 3] - WORLD_ORIGIN_M[2], 0.93, atol=0.011)
+    # pitch and roll are there, and small
+    assert 0.05 < np.degrees(np.arccos(-poses[:, 2, 2])).max() < 1.0
+    # KITTI-360's cameras are 1.069 m and 1.075 m, its Velodyne 0.836 m above the pose's origin (z down)
+    heights = [each[2, 3] for each in (*(rig.CAMERA_TO_POSE[name] for name in rig.CAMERAS), rig.VELO_TO_POSE)]
+    assert rig.POSE_HEIGHT_M - np.array(heights) == pytest.approx([2.00, 2.01, 1.77], abs=0.01)
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     np.testing.assert_allclose(steps, options.mean_speed_m_s * 0.1, rtol=0.08)
     # forwards is where the car goes
@@ -166,14 +161,6 @@ def test_poses_and_timestamps(street):
     assert len(list(root.rglob("timestamps.txt"))) == 3
 
 
-def test_sensors_stand_as_high_as_kitti360s():
-    # cameras 1.069 m and 1.075 m, Velodyne 0.836 m above the pose's origin (z down), that 0.93 m above the road
-    for name, height in (("image_02", 2.00), ("image_03", 2.01)):
-        assert rig.POSE_HEIGHT_M - rig.CAMERA_TO_POSE[name][2, 3] == pytest.approx(height, abs=0.01)
-    assert rig.POSE_HEIGHT_M - rig.VELO_TO_POSE[2, 3] == pytest.approx(1.77, abs=0.01)
-
-
-# ------------------------------------------------------------------------------------------------- determinism
 def test_each_pixel_of_small_pictures_has_its_rays(tmp_path):
     """Beside what the lens cannot reach, too."""
     drive = _Kitti360(SynthesizeOptions(tmp_path, "parking", frames=1, size=32))
@@ -218,7 +205,7 @@ def test_another_seed_is_another_drive(parking, tmp_path):
     camera = "image_03/distance/0000000000.png"
     for name in (
         *(f"data_2d_raw/{SEQUENCE}/image_02/data_rgb/0000000000.png", f"truth/{SEQUENCE}/{camera}"),
-        f"data_3d_raw/{SEQUENCE}/velodyne_points/data/0000000000.bin",
+        f"{SWEEPS}/data/0000000000.bin",
         *(f"simulated_mono/{SEQUENCE}/image_03/0000000000.png", f"data_poses/{SEQUENCE}/poses.txt"),
     ):
         assert other[name] != first[name]
@@ -246,9 +233,7 @@ def test_a_folder_with_something_else_is_refused_untouched(parking, tmp_path):
     [
         ({"frames": 0}, "--frames 0"),
         ({"size": 31}, "--size 31"),
-        ({"size": 5000}, "--size 5000"),
         ({"seed": -1}, "--seed -1"),
-        ({"moving": -1}, "--moving -1"),
         ({"moving": 9}, "--moving 9"),
         ({"layout": "kitti"}, "--layout kitti: no such layout, expected one of kitti-360"),
         ({"scene": "moon"}, "--scene moon.*street, parking, turn"),
@@ -264,10 +249,9 @@ def test_bad_options_are_refused_before_anything_is_written(change, message, tmp
     assert not (tmp_path / "drive").exists()
 
 
-# ------------------------------------------------------------------------------------------------- LiDAR
-def in_camera(root: Path, camera: str, folder: str = "truth") -> np.ndarray:
+def in_camera(root: Path, camera: str, folder: str = "truth", frame: int = 1) -> np.ndarray:
     to_camera = np.linalg.inv(rig.CAMERA_TO_POSE[camera]) @ rig.VELO_TO_POSE
-    return points_of(root, 1, folder)[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
+    return points_of(root, frame, folder)[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3]
 
 
 def agreement(points_in_camera: np.ndarray, camera: str, distance_m: np.ndarray) -> tuple[float, float, int]:
@@ -300,8 +284,8 @@ def test_deskewed_points_agree_with_the_distance_maps(street):
 
 def test_points_lie_on_the_scene_exactly(street, street_world):
     _, root = street
-    model, world = street_world
-    pose = model.drive.pose_to_world(np.array([0.1]))[0]
+    world = street_world
+    pose = world.model.drive.pose_to_world(np.array([0.1]))[0]
     np.testing.assert_allclose(pose[:3, 3] + WORLD_ORIGIN_M, poses_of(root)[1][:3, 3], atol=1e-9)
     points = points_of(root, 1)[::50, :3]
     velo = pose @ rig.VELO_TO_POSE
@@ -317,33 +301,16 @@ def test_points_lie_on_the_scene_exactly(street, street_world):
     assert np.mean(np.abs(hits.distance_m - reach) < 2e-3) > 0.7
 
 
-def test_raw_points_are_skewed_by_the_cars_motion(street):
-    _, root = street
-    raw, true = points_of(root, 2, "raw"), points_of(root, 2)
-    assert raw.shape == true.shape
-    np.testing.assert_array_equal(raw[:, 3], true[:, 3])
-    azimuth = np.degrees(np.arctan2(raw[:, 1], raw[:, 0]))
-    speed = np.linalg.norm(poses_of(root)[3][:3, 3] - poses_of(root)[1][:3, 3]) / 0.2
-    moved = true[:, 0] - raw[:, 0]
-    # clockwise: the left (+90°) a quarter of a turn (25 ms) before the frame's time, the right after it;
-    # a point seen while the car was still behind is nearer at the frame's time
-    for side, quarter_turns in ((90, -1), (0, 0), (-90, 1)):
-        chosen = (np.abs(azimuth - side) < 2) & (np.linalg.norm(raw[:, :3], axis=1) < 15)
-        assert chosen.sum() > 200
-        assert np.median(moved[chosen]) == pytest.approx(quarter_turns * 0.025 * speed, abs=0.02)
-    assert speed * 0.025 > 0.15
-
-
 def test_range_noise_beams_and_azimuths(street, street_world):
     _, root = street
-    model, _ = street_world
+    drive = street_world.model.drive
     raw, true = points_of(root, 1, "raw")[:, :3], points_of(root, 1)[:, :3]
     length = np.linalg.norm(raw, axis=1)
     azimuth = np.arctan2(raw[:, 1], raw[:, 0])
     # exactly the pose of each firing's own moment: undone, only noise along the ray is left
     fired_s = 0.1 - azimuth / (2 * np.pi) * 0.1
-    firing = model.drive.pose_to_world(fired_s) @ rig.VELO_TO_POSE
-    frame = model.drive.pose_to_world(np.array([0.1]))[0] @ rig.VELO_TO_POSE
+    firing = drive.pose_to_world(fired_s) @ rig.VELO_TO_POSE
+    frame = drive.pose_to_world(np.array([0.1]))[0] @ rig.VELO_TO_POSE
     world = true @ frame[:3, :3].T + frame[:3, 3]
     at_firing = np.einsum("nji,nj->ni", firing[:, :3, :3], world - firing[:, :3, 3])
     along = np.linalg.norm(at_firing, axis=1)
@@ -369,15 +336,13 @@ def test_range_noise_beams_and_azimuths(street, street_world):
 
 def test_five_percent_of_points_are_lost(street, street_world, monkeypatch):
     _, root = street
-    model, world = street_world
     some = len(points_of(root, 0))
     monkeypatch.setattr(lidar, "DROPOUT", 0.0)
-    every = len(lidar.sweep(world, model.drive, 0.0, np.random.default_rng([0, 20, 0])).raw)
+    every = len(lidar.sweep(street_world, street_world.model.drive, 0.0, np.random.default_rng([0, 20, 0])).raw)
     # of some 80,000: three standard deviations are 0.0023
     assert 1 - some / every == pytest.approx(0.05, abs=0.0025)
 
 
-# ------------------------------------------------------------------------------------------------- pictures
 def test_masks_lens_and_own_car(street):
     _, root = street
     assert len(rig.CAMERAS) == 2
@@ -480,21 +445,20 @@ def test_shifted_views_are_exactly_sideways(street):
             assert np.mean(distance[below:][lens[below:]] > 0) > 0.99
 
 
-def test_views_beside_the_path_can_be_chosen_and_reach_the_scene(tmp_path, street_model):
+def test_views_beside_the_path_can_be_chosen_and_reach_the_scene(tmp_path, street_world, monkeypatch):
+    without_lidar_check(monkeypatch)
     drive = SynthesizeOptions(tmp_path / "drive", frames=FRAMES, size=40, shifts_m=(0.5, -1.0))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(layout_module, "build_scene", lambda _: street_model)
-        synthesize_drive(drive)
+    drive_in(street_world, drive)
     shifted = read_json(drive.output / "truth" / SEQUENCE / "shifted.json")
     pose, place = poses_of(drive.output)[4], rig.CAMERA_TO_POSE["image_02"]
     for name, shift_m in (("0.5", 0.5), ("-1", -1.0)):
         offset = np.array(shifted[name]["image_02"]["4"])[:3, 3] - (pose @ place)[:3, 3]
         np.testing.assert_allclose(offset, -shift_m * pose[:3, 1], atol=1e-8)
     assert set(shifted) == {"0.5", "-1"}
-    asked = {"sequence": SEQUENCE, "find_ego": False, "refine_poses": False, "sweeps": 0}
+    asked = {"sequence": SEQUENCE, "find_ego": False, "refine_poses": False, "sweeps": 0, "cameras": ("image_02",)}
     convert(Kitti360Options(root=drive.output, output=tmp_path / "scene", **asked), Console(quiet=True))
     views = read_json(tmp_path / "scene/transforms.json")["shifted_views"]
-    assert {name: len(entries) for name, entries in views.items()} == {"0.5": 2, "-1": 2}
+    assert {name: len(entries) for name, entries in views.items()} == {"0.5": 1, "-1": 1}
     assert (tmp_path / "scene" / views["0.5"][0]["truth_rgb_file_path"]).parts[-3] == "shifted_0.5m"
     # a drive of an earlier version is still the same drive
     assert "shifts_m" not in _manifest(SynthesizeOptions(tmp_path))["options"]
@@ -523,17 +487,10 @@ def test_moving_cars_change_place_and_only_they_are_masked(parking, tmp_path):
     assert before != after or not np.array_equal(points_of(still, 0), points_of(root, 0))
 
 
-@pytest.mark.parametrize("scene", ["street", "parking", "turn"])
-def test_movers_drive_and_meet_the_car(scene):
-    options = SynthesizeOptions(Path(), scene, frames=20, moving=3)
-    if scene == "parking":
-        model = build_scene(options)
-        drive, movers = model.drive, model.movers
-    else:
-        # without the houses, which take seconds
-        route = Route((0.0, -1.75))
-        drive = Drive.random(route, 0.0, options.mean_speed_m_s, np.random.default_rng(0))
-        movers = _movers(options, drive, Route((0.0, 1.75), np.pi), 0.0, np.random.default_rng(1))
+def test_movers_drive_and_meet_the_car():
+    options = SynthesizeOptions(Path(), "parking", frames=20, moving=3)
+    model = build_scene(options)
+    drive, movers = model.drive, model.movers
     assert len(movers) == 3
     times = np.arange(20) * 0.1
     own = drive.pose_to_world(times)[:, :2, 3]
@@ -550,23 +507,7 @@ def test_movers_drive_and_meet_the_car(scene):
             assert 7 < apart.min() < 11, "it drives ahead"
 
 
-def test_cars_on_a_roundabout_drive_behind_and_ahead():
-    options = SynthesizeOptions(Path(), "roundabout", frames=20, moving=4)
-    route, _ = roundabout_route()
-    drive = Drive.random(route, 30.0, options.mean_speed_m_s, np.random.default_rng(0))
-    movers = _movers(options, drive, None, 0.0, np.random.default_rng(1))
-    times = np.arange(20) * 0.1
-    own, heading = route.at(30.0 + 5.0 * times)
-    ahead = np.stack((np.cos(heading), np.sin(heading)), -1)
-    sides = []
-    for mover in movers:
-        apart = mover.at(times)[0] - own
-        assert np.linalg.norm(apart, axis=1).min() > 6.0
-        sides.append(np.sign(np.sum(apart * ahead, axis=1)[0]))
-    assert sides == [-1, 1, -1, 1]
-
-
-@pytest.mark.parametrize("frames", [10, 40, 80])
+@pytest.mark.parametrize("frames", [10, 80])
 def test_traffic_passes_stops_and_starts_and_nobody_is_run_over(frames):
     duration_s = max(0.1 * frames, 3.0)
     route = Route((0.0, -1.75))
@@ -596,7 +537,6 @@ def test_traffic_passes_stops_and_starts_and_nobody_is_run_over(frames):
     assert sum(1.5 < height < 2.1 for height in heights) >= 4, "people"
 
 
-# ------------------------------------------------------------------------------------------------- simulated mono
 def test_simulated_estimate_has_a_networks_faults(street):
     _, root = street
     camera = "image_02"
@@ -641,7 +581,6 @@ def test_simulated_edges_are_blurred():
     assert between.sum() < 10
 
 
-# ------------------------------------------------------------------------------------------------- parts
 def test_route_has_unit_speed_and_turns_by_its_angle():
     route = Route((1.0, -2.0), 0.3, turn_rad=-np.pi / 2, turn_at_m=15.0, radius_m=8.0)
     s, step = np.linspace(-5, 50, 2201, retstep=True)
@@ -688,7 +627,8 @@ def test_roundabout_is_driven_around_its_island_and_left_by_the_road_to_the_left
 
 
 def test_nothing_stands_in_the_way_around_the_roundabout(roundabout):
-    model, caster, _ = roundabout
+    world, _ = roundabout
+    model, caster = world.model, world._static
     _, centre = roundabout_route()
     assert np.hypot(*(model.drive.pose_to_world(np.array([0.1]))[0, :2, 3] - centre)) == pytest.approx(10.25, abs=0.15)
     drive = dataclasses.replace(model.drive, start_m=0.0)
@@ -705,32 +645,17 @@ def test_nothing_stands_in_the_way_around_the_roundabout(roundabout):
             directions = ((front - rear) / reach[:, None]).astype(np.float32)
             hit = caster.blocked(rear.astype(np.float32), directions, reach)
             assert len(hit) == 150 and not hit.any(), (side, height, np.flatnonzero(hit))
-
-
-def test_trees_stand_on_the_island(roundabout):
-    model, caster, _ = roundabout
-    _, centre = roundabout_route()
-    # from 3.2 m over the road, all around the island, towards its middle
-    angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)
-    outward = np.column_stack((np.cos(angles), np.sin(angles), np.zeros(180)))
-    origins = np.array((*centre, 3.2)) + 10.0 * outward
-    distance, triangle, _ = caster.first_hits(origins.astype(np.float32), -outward.astype(np.float32))
-    assert np.all(triangle >= 0)
-    on_island = distance < 10.0 + ISLAND_M
-    plants = np.isin(model.static.material[triangle], (Material.LEAF, Material.BARK))
-    assert np.mean(on_island & plants) > 0.5
-    # and there are many small leaves
-    corners = model.static.corners[model.static.material == Material.LEAF]
-    near = np.linalg.norm(corners.mean(1)[:, :2] - centre, axis=1) < ISLAND_M
-    assert near.sum() > 50_000
+    # on the island trees stand, with many small leaves
+    leaves = model.static.corners[model.static.material == Material.LEAF].mean(1)
+    assert (np.linalg.norm(leaves[:, :2] - centre, axis=1) < ISLAND_M).sum() > 50_000
 
 
 def test_roundabout_pictures_sweeps_and_distances_agree(roundabout):
-    _, _, root = roundabout
+    _, root = roundabout
     assert len(rig.CAMERAS) == 2
     for camera in rig.CAMERAS:
-        distance = read_distance_png(truth(root, camera, "distance", 1))
-        share, in_front, count = agreement(in_camera(root, camera), camera, distance)
+        distance = read_distance_png(truth(root, camera, "distance", 0))
+        share, in_front, count = agreement(in_camera(root, camera, frame=0), camera, distance)
         assert count > 10_000
         # leaves are smaller than a pixel
         assert share > 0.88
@@ -740,18 +665,6 @@ def test_roundabout_pictures_sweeps_and_distances_agree(roundabout):
         upper, lower = sky[: SIZE // 2], sky[int(0.6 * SIZE) :]
         assert 0.2 < upper[keep[: SIZE // 2]].mean() < 0.9
         assert not lower.any(), "the road's end is not the sky"
-
-
-def test_pose_is_a_rotation_at_every_time():
-    route = Route((0.0, 0.0), turn_rad=np.pi / 2, turn_at_m=3.0)
-    drive = Drive.random(route, 0.0, 7.0, np.random.default_rng(5))
-    poses = drive.pose_to_world(np.linspace(0, 4, 81))
-    rotation = poses[:, :3, :3]
-    np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (81, 1, 1)), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.det(rotation), 1, atol=1e-12)
-    # pitch and roll are there, and small
-    tilt = np.degrees(np.arccos(-rotation[:, 2, 2]))
-    assert 0.2 < tilt.max() < 1.0
 
 
 def test_first_hits_are_the_triangles_planes():
@@ -769,21 +682,3 @@ def test_first_hits_are_the_triangles_planes():
     np.testing.assert_allclose(origins + distance[:, None].astype(np.float64) * directions, inside, atol=2e-4)
     assert caster.blocked(origins, directions, distance + 0.01).all()
     assert not caster.blocked(origins, directions, distance * 0.999 - 1e-3).any()
-
-
-def test_noise_has_zero_mean_and_fades_with_the_footprint():
-    noise = Noise(0)
-    rng = np.random.default_rng(1)
-    u, v = rng.uniform(-1000, 1000, (2, 20000)).astype(np.float32)
-    spectrum = ((0.1, 1.0), (1.0, 1.0))
-    sharp = noise.waves(u, v, np.full(20000, 1e-3, np.float32), spectrum)
-    half = noise.waves(u, v, np.full(20000, 0.2, np.float32), spectrum)
-    gone = noise.waves(u, v, np.full(20000, 2.0, np.float32), spectrum)
-    assert abs(sharp.mean()) < 0.02
-    # two waves of standard deviation 0.5, less what interpolation takes
-    assert sharp.std() == pytest.approx(0.5 * np.sqrt(2), rel=0.08)
-    assert half.std() == pytest.approx(0.5, rel=0.08)
-    assert np.all(gone == 0)
-    # the same place, the same value, whoever asks
-    np.testing.assert_array_equal(noise.waves(u[:7], v[:7], np.full(7, 1e-3, np.float32), spectrum), sharp[:7])
-    assert not np.array_equal(Noise(1).wave(u, v, 1.0, 0), noise.wave(u, v, 1.0, 0))
