@@ -17,7 +17,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.matches import Matches, sights_of
-from edge_depth_nerf.poses.tracks import features_joined, join_matches, reprojection_px, spread, triangulate
+from edge_depth_nerf.poses.tracks import Tracks, features_joined, join_matches, reprojection_px, spread, triangulate
 from edge_depth_nerf.process.colmap import refine as refining
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, _Bundle, adjust_bundle
 from edge_depth_nerf.process.colmap.refine import Refinement, _is_check, refine
@@ -103,13 +103,18 @@ def step_errors(path: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     return float(np.mean([np.linalg.norm(one[:3, 3]) for one in off])), float(np.degrees(np.mean(turns)))
 
 
-# ---- tracks ----------------------------------------------------------------------------------------------------
-@pytest.mark.slow
-def test_matches_join_into_one_track_for_each_point() -> None:
+@pytest.fixture(scope="module")
+def exact() -> tuple[World, list[Matches], Tracks, np.ndarray]:
+    """A world, matches without noise, the tracks that they join into, and the tracks' points."""
     given = world(1)
     matches = given.matches(0.0)
     tracks = join_matches(matches)
-    points = triangulate(tracks, given.poses())
+    return given, matches, tracks, triangulate(tracks, given.poses())
+
+
+@pytest.mark.slow
+def test_matches_join_into_one_track_for_each_point(exact) -> None:
+    given, matches, tracks, points = exact
     known = np.isfinite(points).all(-1)
     assert known.sum() > 300
     # features are numbered as their points are, but a camera's pictures are matched among themselves alone
@@ -122,10 +127,8 @@ def test_matches_join_into_one_track_for_each_point() -> None:
 
 
 @pytest.mark.slow
-def test_reprojection_is_in_pixels() -> None:
-    given = world(2)
-    tracks = join_matches(given.matches(0.0))
-    points = triangulate(tracks, given.poses())
+def test_reprojection_is_in_pixels(exact) -> None:
+    given, _, tracks, points = exact
     moved = given.poses().copy()
     moved[:, :3, 3] += (0.01, -0.01, 0.005)
     off_px = reprojection_px(tracks, points, moved)
@@ -166,8 +169,8 @@ def test_rays_that_hardly_differ_give_no_point() -> None:
 
 
 @pytest.mark.slow
-def test_few_tracks_are_kept_evenly_and_the_longest_first() -> None:
-    tracks = join_matches(world(3).matches(0.0))
+def test_few_tracks_are_kept_evenly_and_the_longest_first(exact) -> None:
+    tracks = exact[2]
     lengths = np.bincount(tracks.track)
     kept = spread(tracks, 20)
     assert np.bincount(kept.picture).min() >= min(20, np.bincount(tracks.picture).min())
@@ -177,7 +180,6 @@ def test_few_tracks_are_kept_evenly_and_the_longest_first() -> None:
     assert len(triangulate(join_matches([]), np.zeros((0, 4, 4)))) == 0
 
 
-# ---- the bundle ------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def colmap() -> Any:
     return pytest.importorskip("pycolmap")
@@ -272,7 +274,6 @@ def test_softness_is_in_metres_and_radians(colmap: Any) -> None:
     assert squares == pytest.approx([1.0] * 6, rel=0.01)
 
 
-# ---- a recording -----------------------------------------------------------------------------------------------
 def recorded(given: World, path: np.ndarray, poses_s: float = 0.1, shutter_s: float = 0.004) -> Recording:
     """A recording of a path; the second camera fires a little later."""
     times_s = poses_s * np.arange(len(path))
@@ -322,17 +323,11 @@ def test_a_recording_moves_as_a_whole(colmap: Any, refined: Refined) -> None:
         np.testing.assert_allclose(on_rig, at, atol=1e-6)
     before, after = (step_errors(one, given.path) for one in (path, moved.trajectory.vehicle_to_world))
     assert after[0] < 0.1 * before[0] and after[1] < 0.1 * before[1]
-
-
-@pytest.mark.slow
-def test_what_was_found_is_kept_for_the_same_inputs(colmap: Any, refined: Refined) -> None:
-    given = world(13, points=250)
-    drive = recorded(given, given.disturbed())
-    first = refined(drive, given.matches(0.2))
+    # what was found is kept for the same inputs
     again = refined(drive, [])
-    assert first.trajectory is not None and again.trajectory is not None
-    np.testing.assert_array_equal(first.trajectory.vehicle_to_world, again.trajectory.vehicle_to_world)
-    assert again.notices == first.notices
+    assert again.trajectory is not None
+    np.testing.assert_array_equal(again.trajectory.vehicle_to_world, moved.trajectory.vehicle_to_world)
+    assert again.notices == moved.notices
     other = refined(recorded(given, given.path), [])
     assert "only 0 features" in other.notices[-1]
 
@@ -352,16 +347,13 @@ def test_poses_that_are_far_off_are_not_trusted_to_features(colmap: Any, refined
     given = world(9, points=250)
     refined.monkeypatch.setattr(refining, "FURTHEST_M", 0.02)
     kept = refined(recorded(given, given.disturbed()), given.matches(0.3))
-    assert "too far to be trusted" in kept.notices[-1]
-    assert "--poses colmap" in kept.notices[-1]
+    assert "too far to be trusted" in kept.notices[-1] and "--poses colmap" in kept.notices[-1]
 
 
 def test_few_features_change_nothing(colmap: Any, refined: Refined) -> None:
     given = world(10, points=6)
     kept = refined(recorded(given, given.disturbed()), given.matches(0.3))
     assert "could be matched for the check" in kept.notices[-1]
-    none = refined(recorded(given, given.path), [])
-    assert "only 0 features" in none.notices[-1]
 
 
 @pytest.mark.slow
