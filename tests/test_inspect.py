@@ -1,7 +1,6 @@
 """Looking at a scene: its figures against independent numbers, its warnings, its pictures pixel by pixel."""
 
 import io
-import json
 import math
 import shutil
 import subprocess
@@ -9,6 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -45,11 +45,13 @@ from edge_depth_nerf.base.pictures import (
     tinted,
 )
 from edge_depth_nerf.entry import main
+from edge_depth_nerf.inspecting import figures
 from edge_depth_nerf.inspecting.command import inspect_scene
-from edge_depth_nerf.inspecting.figures import measure, measured_frames
+from edge_depth_nerf.inspecting.figures import map_figures, measure, measured_frames
 from edge_depth_nerf.inspecting.findings import Finding, find, limited
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX, check_poses
+from edge_depth_nerf.inspecting.sheets import draw_sheet
 from edge_depth_nerf.inspecting.shown_prior import ShownScene
 from edge_depth_nerf.inspecting.top_view import GAP, GREYS, HELD_OUT, PATH, TRAINING, pose_check_figure, top_view
 from edge_depth_nerf.lidar.trajectory import Trajectory
@@ -62,8 +64,15 @@ from edge_depth_nerf.scene.reader import read_scene
 pytestmark = pytest.mark.slow
 
 
-def look(scene: Path, output: Path, **options: Any) -> dict[str, Any]:
+def look(scene: Path, output: Path | None, **options: Any) -> dict[str, Any]:
     return inspect_scene(InspectOptions(scene, output, **{"size": 64, **options}), Console(quiet=True))
+
+
+def sheet_of_first(folder: Path, width_px: int) -> np.ndarray:
+    """The sheet of a scene's first picture, without a look at the others."""
+    scene = read_scene(folder)
+    maps = ShownScene(scene).maps(scene.pictures[0])
+    return draw_sheet(scene, measure(scene.pictures[0], maps), maps, width_px)
 
 
 def warnings_of(scene: Path) -> list[Finding]:
@@ -100,10 +109,7 @@ def test_what_is_returned_is_what_is_written(sample):
     for name in (*summary["sheets"], "top_view.png"):
         assert read_image(output / name).std() > 10
     assert summary["warnings"] == []
-
-
-def test_its_poses_agree_with_its_pictures(sample):
-    summary, output, _ = sample
+    # its poses agree with its pictures
     assert summary["epipolar"]["median_px"] < 0.3
     for camera in summary["cameras"].values():
         assert camera["epipolar"]["median_px"] < 0.3
@@ -158,14 +164,10 @@ def test_poses_that_disagree_with_the_pictures(drive, medians_px, refined, frame
     assert ("process the drive with --refine-poses" in warning.text) is not refined
 
 
-def test_poses_that_agree_give_no_warning(drive):
+def test_poses_that_agree_give_no_warning_and_are_drawn_where_they_are(drive):
     scene = read_scene(drive)
     assert find(scene, [], agreements([0.2, 0.3, 0.9, math.nan])) == []
     assert find(scene, [], agreements([math.nan] * 5)) == []
-
-
-def test_poses_are_drawn_where_they_are(drive):
-    scene = read_scene(drive)
     (line, limit) = pose_check_figure(scene, agreements([0.2, math.nan, 0.6])).axes[0].lines
     assert np.asarray(line.get_xydata()).tolist() == [[0.5, 0.2], [2.5, 0.6]]
     assert line.get_label() == "left"
@@ -173,7 +175,7 @@ def test_poses_are_drawn_where_they_are(drive):
 
 
 def test_its_counts(sample, sample_drive):
-    summary, _, _ = sample
+    summary, _, said = sample
     assert (summary["pictures"], summary["moments"], summary["training"], summary["held_out"]) == (24, 12, 22, 2)
     header = (sample_drive / "points.ply").read_bytes()[:200].decode("latin1")
     assert summary["points"] == int(header.split("element vertex ")[1].split()[0])
@@ -184,6 +186,9 @@ def test_its_counts(sample, sample_drive):
         assert camera["angle_limit_deg"] == 95.0
         assert camera["size_px"] == [128, 128]
         assert (camera["model"], camera["original_model"]) == ("KANNALA_BRANDT", "MEI")
+    for words in ("22 for training, 2 held out", "8.9 m (image_02)", "KANNALA_BRANDT for MEI", "128×128"):
+        assert words in said
+    assert "measured on all pictures" in said and "Error of the monocular maps" in said
 
 
 def test_its_path(sample, sample_drive):
@@ -238,8 +243,7 @@ def test_its_maps(sample, sample_drive, camera):
 
 def test_a_sheet_shows_the_maps(sample, sample_drive):
     """The picture is where it should be, and the truth beside it has the truth's colours."""
-    _, output, _ = sample
-    sheet = read_image(output / "image_02_0000000003.png")
+    sheet = read_image(sample[1] / "image_02_0000000003.png")
     # three rows of three panels of 64 px, the last of them empty, under two lines
     assert sheet.shape == (2 * 28 + 3 * (64 + 70 + 14), 3 * (64 + 14), 3)
     top, left = 2 * 28 + 7 + 30, 7
@@ -249,18 +253,11 @@ def test_a_sheet_shows_the_maps(sample, sample_drive):
     assert (sheet[top : top + 64, left : left + 64] == picture).all()
     truth = read_distance_png(sample_drive / "truth/image_02/distance/0000000003.png")
     mask = cv2.imread(str(sample_drive / "masks/image_02.png"), cv2.IMREAD_GRAYSCALE) > 0
-    below, third = top + 2 * (64 + 70 + 14), left
-    shown = sheet[below : below + 64, third : third + 64]
+    below = top + 2 * (64 + 70 + 14)
+    shown = sheet[below : below + 64, left : left + 64]
     expected = colour_distance(truth, mask)
     candidates = [expected[row::2, column::2] for row in (0, 1) for column in (0, 1)]
     assert max((shown == candidate).all(-1).mean() for candidate in candidates) > 0.99
-
-
-def test_the_figures_in_the_terminal(sample):
-    _, _, said = sample
-    for words in ("22 for training, 2 held out", "8.9 m (image_02)", "KANNALA_BRANDT for MEI", "128×128"):
-        assert words in said
-    assert "measured on all pictures" in said and "Error of the monocular maps" in said
 
 
 # ---- small drives with one fault each --------------------------------------------------------------------------
@@ -315,9 +312,10 @@ def drive(tmp_path) -> Path:
     return write_drive(tmp_path / "drive")
 
 
-def test_a_drive_without_fault(drive, tmp_path):
-    summary = look(drive, tmp_path / "out", frames=1)
-    assert summary["warnings"] == []
+def test_a_drive_without_fault(drive):
+    summary = look(drive, None, frames=1)
+    assert read_json(drive.parent / "drive_inspection/summary.json") == summary
+    assert not (drive / "summary.json").exists() and summary["warnings"] == []
     camera = summary["cameras"]["left"]
     path = {"camera": "left", "length_m": 5.5, "spacing_median_m": 0.5, "spacing_max_m": 0.5, "duration_s": 1.1}
     assert summary["path"] == {**path, "speed_mean_mps": 5.0, "speed_max_mps": 5.0}
@@ -493,29 +491,15 @@ def test_long_drives_are_sampled_evenly(tmp_path, numbers, cameras, measured):
     assert np.allclose(shown, numbers * np.array([1, 3, 5, 7]) / 8, atol=0.03 * numbers + 1)
 
 
-def test_the_summary_says_that_it_is_of_a_sample(tmp_path):
-    scene = write_drive(tmp_path / "drive", 70)
-    summary = look(scene, tmp_path / "out", frames=1)
-    assert summary["measured"] == "measured on 64 of the 70 pictures, evenly over the drive"
-    assert summary["maps"]["measured_pictures"] == len(summary["frames"]) == 64
-
-
-def test_more_frames_than_there_are(tmp_path):
-    assert len(look(write_drive(tmp_path / "drive", 3), tmp_path / "out", frames=50)["sheets"]) == 3
-
-
-def test_a_second_look_leaves_no_sheets_of_the_first(drive, tmp_path):
-    output = tmp_path / "out"
-    look(drive, output, frames=2)
+def test_a_second_look_says_that_it_is_of_a_sample_and_leaves_no_sheets_of_the_first(tmp_path, monkeypatch):
+    drive, output = write_drive(tmp_path / "drive", 3), tmp_path / "out"
+    assert len(look(drive, output, frames=50)["sheets"]) == 3
     (output / "notes.png").write_bytes(b"mine")
+    monkeypatch.setattr(figures, "MEASURED_PICTURES", 2)
     summary = look(drive, output, frames=1)
+    assert summary["measured"] == "measured on 2 of the 3 pictures, evenly over the drive"
+    assert summary["maps"]["measured_pictures"] == len(summary["frames"]) == 2 and len(summary["sheets"]) == 1
     assert {path.name for path in output.iterdir()} == {*summary["sheets"], "top_view.png", "summary.json", "notes.png"}
-
-
-def test_the_output_lies_beside_the_scene(drive):
-    inspect_scene(InspectOptions(drive, frames=1, size=64), Console(quiet=True))
-    assert (drive.parent / "drive_inspection" / "summary.json").is_file()
-    assert not (drive / "summary.json").exists()
 
 
 @pytest.mark.parametrize(
@@ -528,24 +512,20 @@ def test_the_output_lies_beside_the_scene(drive):
         (("lidar_file_path", "mono_file_path", "mask_path"), 1),
     ],
 )
-def test_panels_of_what_is_missing_are_left_out(drive, tmp_path, missing, panels):
+def test_panels_of_what_is_missing_are_left_out(drive, missing, panels):
     change(drive, without(*missing))
-    (name,) = look(drive, tmp_path / "out", frames=1, size=200)["sheets"]
-    height, width = read_image(tmp_path / "out" / name).shape[:2]
-    columns = min(panels, 3)
-    rows = -(-panels // 3)
-    assert (height, width) == (2 * 28 + rows * (150 + 70 + 14), columns * (200 + 14))
+    columns, rows = min(panels, 3), -(-panels // 3)
+    assert sheet_of_first(drive, 200).shape == (2 * 28 + rows * (150 + 70 + 14), columns * (200 + 14), 3)
 
 
-def test_distances_from_motion_have_a_panel(drive, tmp_path):
-    (name,) = look(drive, tmp_path / "without", frames=1, size=200)["sheets"]
+def test_distances_from_motion_have_a_panel(drive):
+    before = sheet_of_first(drive, 200)
     pictures = read_scene(drive).pictures
     maps = ((each.name, np.full((each.lens.height, each.lens.width), 5, np.float32)) for each in pictures)
     write_maps(drive, "motion", maps, {"kind": "for a test"})
-    summary = look(drive, tmp_path / "with", frames=1, size=200)
-    (with_motion,) = summary["sheets"]
-    assert summary["maps"]["motion_coverage"]["mean"] == 1
-    before, after = (read_image(path) for path in (tmp_path / "without" / name, tmp_path / "with" / with_motion))
+    after, scene = sheet_of_first(drive, 200), ShownScene(read_scene(drive))
+    picture = scene.scene.pictures[0]
+    assert map_figures([measure(picture, scene.maps(picture))])["motion_coverage"]["mean"] == 1
     # six panels in three columns; two more, motion and what the prior comes from, in a row of their own
     assert before.shape[1] == after.shape[1] == 3 * (200 + 14)
     row = after[-(150 + 70) :]
@@ -555,14 +535,12 @@ def test_distances_from_motion_have_a_panel(drive, tmp_path):
 
 def test_a_sheet_and_a_view_from_above_are_as_wide_as_a_window(drive, tmp_path):
     """Wider ones would be shrunk, and their letters with them."""
-    low = write_scene(tmp_path / "low", [pinhole(64, 28)])
+    low = write_scene(tmp_path / "low", [pinhole(64, 28)], frames=1)
     spread_out = [replace(each, position_m=each.position_m * 50) for each in read_scene(drive).pictures]
     figure = top_view(replace(read_scene(drive), pictures=tuple(spread_out)), None, [], [])
     assert 1100 < drawn(figure).shape[1] < 1280
     for scene in (drive, low):
-        inspect_scene(InspectOptions(scene, tmp_path / "out", frames=1), Console(quiet=True))
-        (sheet,) = (tmp_path / "out").glob("*_0*.png")
-        assert read_image(sheet).shape[1] == 3 * (410 + 14)
+        assert sheet_of_first(scene, InspectOptions(scene).size).shape[1] == 3 * (410 + 14)
 
 
 def test_the_sheet_says_what_a_prior_comes_from(drive):
@@ -588,26 +566,22 @@ def test_the_sheet_says_what_a_prior_comes_from(drive):
 
 # ---- other people's scenes -------------------------------------------------------------------------------------
 def test_z_depth_of_a_pinhole_scene_becomes_distance(tmp_path):
-    scene = write_scene(tmp_path / "scene", [pinhole()], lidar=False, mono=False, mask=False, truth=False, split=False)
+    scene = write_scene(tmp_path / "scene", [pinhole()], 2, False, False, mask=False, truth=False, split=False)
     meta = read_json(scene / "transforms.json")
     del meta["depth_unit_scale_factor"]
     depth_mm = np.full((28, 32), 5000, np.uint16)
-    for number, frame in enumerate(meta["frames"]):
-        # once as nerfstudio's PNG in millimetres, once as an array
-        frame["depth_file_path"] = f"depth/{number}.{'png' if number else 'npy'}"
-        (scene / "depth").mkdir(exist_ok=True)
-        if number:
-            cv2.imwrite(str(scene / frame["depth_file_path"]), depth_mm)
-        else:
-            np.save(scene / frame["depth_file_path"], depth_mm[..., None])
-    for frame in meta["frames"]:
-        frame["k1"] = 0.0
+    (scene / "depth").mkdir()
+    # once as nerfstudio's PNG in millimetres, once as an array
+    cv2.imwrite(str(scene / "depth/1.png"), depth_mm)
+    np.save(scene / "depth/0.npy", depth_mm[..., None])
+    for frame, name in zip(meta["frames"], ("0.npy", "1.png"), strict=True):
+        frame |= {"depth_file_path": f"depth/{name}", "k1": 0.0}
     write_json(scene / "transforms.json", meta)
     inspected = read_scene(scene)
     x = (np.arange(32) + 0.5 - 16) / 20.0
     y = (np.arange(28)[:, None] + 0.5 - 14) / 20.5
     expected = 5 * np.sqrt(x**2 + y**2 + 1)
-    for picture in inspected.pictures[:2]:
+    for picture in inspected.pictures:
         maps = inspected.maps(picture)
         assert maps.lidar_m is not None and np.allclose(maps.lidar_m, expected, rtol=1e-4)
         assert default_source(picture.files) == "lidar"
@@ -657,19 +631,18 @@ def test_a_scene_that_cannot_be_read(drive, tmp_path, words):
     assert words in str(raised.value) and str(drive) in str(raised.value)
 
 
-@pytest.mark.parametrize(("options", "words"), [({"frames": 0}, "--frames 0"), ({"size": 9}, "--size 9")])
-def test_options_out_of_range(drive, tmp_path, options, words):
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"frames": 0}, "--frames 0"), ({"size": 9}, "--size 9"), ({"output": "points.ply"}, "is a file")],
+)
+def test_options_that_cannot_be_used(drive, options, words):
     with pytest.raises(InputError, match=words):
-        look(drive, tmp_path / "out", **options)
+        look(drive, **{"output": drive / options.pop("output", "out"), **options})
 
 
-def test_an_output_that_is_a_file(drive):
-    with pytest.raises(InputError, match="is a file"):
-        look(drive, drive / "points.ply")
-
-
-def test_the_command_runs_without_nerfstudio(drive, tmp_path, monkeypatch, capsys):
+def test_the_command_runs_without_nerfstudio(tmp_path, monkeypatch, capsys):
     """Importing nerfstudio takes longer than the whole command."""
+    drive = write_drive(tmp_path / "drive", 1)
     code = (
         "import sys; sys.modules['nerfstudio'] = None; from edge_depth_nerf.entry import main; "
         f"sys.argv = ['edge-depth-nerf', 'inspect', {str(drive)!r}, '--output', {str(tmp_path / 'out')!r}, "
@@ -753,10 +726,11 @@ def test_a_legend_of_colours():
 
 
 def test_drawings_of_several_threads_are_the_same():
-    widths = [300 + 20 * number for number in range(8)] * 3
+    widths = [300 + 20 * number for number in range(8)] * 2
+    expected = {width: colour_bar(SIGMA, width) for width in widths}
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda width: colour_bar(SIGMA, width), widths))
-    assert all((one == colour_bar(SIGMA, width)).all() for one, width in zip(found, widths, strict=True))
+    assert all((one == expected[width]).all() for one, width in zip(found, widths, strict=True))
 
 
 def test_maps_keep_their_values_when_they_shrink():
@@ -784,9 +758,12 @@ def test_text_that_is_too_long_becomes_smaller(text):
     assert not text or (columns.min() >= 1 and columns.max() < 99)
 
 
+picture_of = cache(drawn)
+
+
 def near(figure: Figure, x_m: float, y_m: float) -> set[str]:
     """Colours within a pixel of a place of the map."""
-    picture = drawn(figure)
+    picture = picture_of(figure)
     x, from_below = figure.axes[0].transData.transform((x_m, y_m))
     row, column = int(len(picture) - from_below), int(x)
     return {
@@ -798,7 +775,7 @@ def test_the_top_view_is_to_scale(drive):
     """Dots at their places by the axes' numbers; the higher point is darker."""
     scene = read_scene(drive)
     figure = top_view(scene, scene.points_m(), [], shown=[])
-    drawn(figure)
+    picture_of(figure)
     axes = figure.axes[0]
     (x0, y0), (x1, y1) = axes.transData.transform([(0, 0), (1, 1)])
     assert x1 - x0 == pytest.approx(y1 - y0, rel=1e-6) and x1 - x0 > 20
@@ -809,10 +786,7 @@ def test_the_top_view_is_to_scale(drive):
     assert near(figure, 1.0, -3.0) == near(figure, 4.0, 2.0) == {"#ffffff"}
     words = {text.get_text() for text in figure.legends[0].get_texts()}
     assert words == {"points, higher ones darker", "view of left", "travel", "training", "held out"}
-
-
-def test_the_top_view_names_frames_with_a_sheet(drive):
-    figure = top_view(read_scene(drive), None, [], shown=[1, 9])
+    figure = top_view(scene, None, [], shown=[1, 9])
     assert [text.get_text() for text in figure.axes[0].texts] == ["1", "9"]
     assert "frame with a sheet" in {text.get_text() for text in figure.legends[0].get_texts()}
 
@@ -841,24 +815,19 @@ def test_the_top_view_marks_gaps(drive):
     """From 2 m to 9.5 m of a path from 0 to 12.5 m."""
     change(drive, shift_from(5, 7))
     scene = read_scene(drive)
-    figure = top_view(scene, None, find(scene, []), [])
+    figure, without_findings = (top_view(scene, None, found, []) for found in (find(scene, []), []))
     assert [text.get_text() for text in figure.axes[0].texts] == ["7.5 m"]
     for x_m in (3.0, 9.0):
         assert GAP in near(figure, x_m, 0.0)
-        assert PATH in near(top_view(scene, None, [], []), x_m, 0.0)
+        assert PATH in near(without_findings, x_m, 0.0)
     for x_m in (1.75, 9.75):
         assert GAP not in near(figure, x_m, 0.0)
 
 
-def test_a_scene_of_one_picture(tmp_path):
-    summary = look(write_drive(tmp_path / "drive", 1), tmp_path / "out")
-    assert summary["path"]["length_m"] == 0 and len(summary["sheets"]) == 1
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["moments"] == 1
-
-
 def test_how_far_another_path_lies(tmp_path):
-    drive = write_drive(tmp_path / "drive", 2)
-    assert look(drive, tmp_path / "out")["paths_agree"] is None
+    drive = write_drive(tmp_path / "drive", 1)  # a path without length
+    summary = look(drive, tmp_path / "out")
+    assert summary["paths_agree"] is None and summary["path"]["length_m"] == 0 and summary["moments"] == 1
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 0, 3] = np.arange(4)
     path = Trajectory(np.arange(4.0), poses)
