@@ -1,4 +1,4 @@
-"""The prose rules: pages, messages and docstrings pass, and riddles of former pages do not."""
+"""The prose rules, by which `make lint` checks all texts: they refuse riddles of former pages, and nothing else."""
 
 import importlib.util
 import re
@@ -21,8 +21,11 @@ def prose() -> ModuleType:
     return module
 
 
-def test_pages_messages_and_docstrings_are_plain(prose, capsys):
-    assert prose.main() == 0, capsys.readouterr().out
+def test_the_linters_check_pages_messages_and_docstrings(prose):
+    lint = re.search(r"^lint:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert lint and "docs/check_prose.py" in lint[1]
+    for pattern in (*prose.PAGES, prose.MODULES):
+        assert [*ROOT.glob(pattern)], pattern
 
 
 @pytest.mark.parametrize(
@@ -79,17 +82,12 @@ def test_a_riddle_in_a_docstring_is_refused(prose, tmp_path, capsys, where, line
     assert prose.main(tmp_path) == 0
 
 
-def test_a_long_sentence_in_a_docstring_is_refused(prose, tmp_path, capsys):
+def test_a_long_sentence_in_a_docstring_is_refused_and_code_and_headings_are_not(prose, tmp_path, capsys):
     module = tmp_path / "edge_depth_nerf/module.py"
     module.parent.mkdir(parents=True)
     module.write_text(f'"""A module.\n\nA {"very " * 40}long sentence.\n"""\n')
     assert prose.main(tmp_path) == 1
     assert "edge_depth_nerf/module.py:3: a sentence of 43 words" in capsys.readouterr().out
-
-
-def test_code_and_headings_of_a_docstring_are_left_alone(prose, tmp_path):
-    module = tmp_path / "edge_depth_nerf/module.py"
-    module.parent.mkdir(parents=True)
     module.write_text(
         '"""Reads `moment`.\n\n    print(moment)\n\nIt is plain.\n"""\n\n\ndef read(time_s):\n'
         '    """Read what `moment_s` holds; the function returns it.\n\n'
