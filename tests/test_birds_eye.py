@@ -1,5 +1,6 @@
 """The road from above: rendered of a yard whose every distance is known in closed form."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -85,16 +86,24 @@ def drive(tmp_path_factory) -> RoomDrive:
 @pytest.fixture(scope="module")
 def scene(drive) -> Path:
     output = drive.root.parent / "scene"
-    convert(Kitti360Options(root=drive.root, sequence=SEQUENCE, output=output, sweeps=0, find_ego=False), QUIET)
+    fast: dict[str, Any] = {"find_ego": False, "refine_poses": False, "motion": False}
+    convert(Kitti360Options(root=drive.root, sequence=SEQUENCE, output=output, sweeps=0, **fast), QUIET)
     return output
 
 
-@pytest.fixture
-def trained(scene, tmp_path, monkeypatch) -> Path:
-    """The config.yml of a training whose model is the yard."""
+@pytest.fixture(scope="module")
+def of_the_yard(scene) -> Iterator[None]:
+    """Whatever is trained, its model is the yard."""
     offset_m = np.array(read_json(scene / "transforms.json")["world_offset_m"])
-    monkeypatch.setattr(birds_eye, "load_model", lambda *_: None)
-    monkeypatch.setattr(birds_eye, "Caster", lambda _, place: Caster(YardModel(place, offset_m), place))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(birds_eye, "load_model", lambda *_: None)
+        patch.setattr(birds_eye, "Caster", lambda _, place: Caster(YardModel(place, offset_m), place))
+        yield
+
+
+@pytest.fixture
+def trained(scene, of_the_yard, tmp_path) -> Path:
+    """The config.yml of a training."""
     return write_config(tmp_path / "run/config.yml", scene)
 
 
@@ -110,6 +119,11 @@ def render(config: Path, **options: Any) -> tuple[np.ndarray, np.ndarray, np.nda
     return colours, heights, np.stack([a * column + b * row + c, d * column + e * row + f], -1)
 
 
+@pytest.fixture(scope="module")
+def road(scene, of_the_yard, tmp_path_factory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return render(write_config(tmp_path_factory.mktemp("road") / "config.yml", scene))
+
+
 def seen_by_a_camera(drive: RoomDrive, points: np.ndarray) -> np.ndarray:
     """Whether a training camera sees points, with a straight line to each: of the lens only its angle is asked."""
     seen = np.zeros(len(points), bool)
@@ -123,8 +137,8 @@ def seen_by_a_camera(drive: RoomDrive, points: np.ndarray) -> np.ndarray:
     return seen
 
 
-def test_pixels_are_where_the_world_file_says_and_as_high_as_the_yard(drive, trained):
-    colours, heights, place = render(trained)
+def test_pixels_are_where_the_world_file_says_and_as_high_as_the_yard(road):
+    colours, heights, place = road
     shown = colours[..., 3] == 255
     np.testing.assert_array_equal(shown, np.isfinite(heights))
     assert set(np.unique(colours[..., 3])) == {0, 255} and 0.3 < shown.mean() < 0.9
@@ -136,8 +150,8 @@ def test_pixels_are_where_the_world_file_says_and_as_high_as_the_yard(drive, tra
     assert colours.shape[:2] == tuple(np.round(np.ptp(place, axis=(0, 1))[::-1] / SIDE_M).astype(int) + 1)
 
 
-def test_what_nothing_shows_is_transparent(drive, trained):
-    colours, _, place = render(trained)
+def test_what_nothing_shows_is_transparent(drive, road):
+    colours, _, place = road
     shown = colours[..., 3] == 255
     path = [[drive.camera_to_world(name, frame)[:2, 3] for frame in (0, 8)] for name in ("image_02", "image_03")]
     first, last = np.mean(path, axis=0)
@@ -156,8 +170,8 @@ def test_what_nothing_shows_is_transparent(drive, trained):
     assert (shown[near] == truly).mean() > 0.97 and shown[near][~truly].mean() < 0.25
 
 
-def test_what_is_above_the_cut_is_not_in_the_picture(trained, tmp_path):
-    _, below, place = render(trained)
+def test_what_is_above_the_cut_is_not_in_the_picture(road, trained, tmp_path):
+    _, below, place = road
     under_roof = np.isfinite(below) & (place[..., 0] > ROOF_FROM_M + 0.1)
     assert under_roof.sum() > 1000 and below[under_roof].max() < BOX_M
     # rays that begin above the roof meet it; cameras see its lower side alone, 0.3 m below: near enough
@@ -184,20 +198,21 @@ def test_an_interrupted_run_goes_on(trained, monkeypatch):
     monkeypatch.setattr(birds_eye, "TILE_PX", 16)
     monkeypatch.setattr("edge_depth_nerf.films.ground_plan.TILE_PX", 16)
     monkeypatch.setattr(birds_eye, "render_tile", until_the_third)
+    narrow = {"margin_m": 2.0}
     with pytest.raises(KeyboardInterrupt):
-        render(trained)
+        render(trained, **narrow)
     tiles = sorted((trained.parent / "birds_eye/tiles").iterdir())
     assert len(tiles) == 2
     monkeypatch.setattr(birds_eye, "render_tile", lambda *given: made.append(given[1]) or whole(*given))
-    colours, heights, _ = render(trained)
+    colours, heights, _ = render(trained, **narrow)
     # the one that was interrupted is begun again, the two before are not
     assert len(made) == 1 + len({(tile.row, tile.column) for tile in made})
-    other = render(trained, output=trained.parent / "at_once")
+    other = render(trained, output=trained.parent / "at_once", **narrow)
     np.testing.assert_array_equal(colours, other[0])
     np.testing.assert_array_equal(heights, other[1])
     # a finished picture is kept, and its parts are gone
     count, changed = len(made), (trained.parent / "birds_eye/road.png").stat().st_mtime_ns
-    render(trained)
+    render(trained, **narrow)
     assert len(made) == count and (trained.parent / "birds_eye/road.png").stat().st_mtime_ns == changed
     assert sorted(path.name for path in (trained.parent / "birds_eye").iterdir()) == [
         *("birds_eye.json", "height.tfw", "height.tif", "road.pgw", "road.png"),
