@@ -126,6 +126,8 @@ def test_an_orbit_goes_around_a_point_of_the_way_and_looks_at_it():
     assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1)
     beyond, _ = orbit(straight(), 36, 100.0, 3.0, None)
     assert np.allclose(beyond[:, :3, 3].mean(axis=0), [0, 40, 0])
+    # smaller than the vehicle, where that is asked for
+    assert orbit(straight(), 12, 5.0, 0.5, None)[1] == 0.5
 
 
 @pytest.mark.parametrize(
@@ -140,10 +142,6 @@ def test_an_orbit_goes_around_a_point_of_the_way_and_looks_at_it():
 )
 def test_an_orbit_stays_inside_what_was_seen(points, radius_m):
     assert orbit(straight(), 12, 5.0, 3.0, points)[1] == pytest.approx(radius_m, abs=0.02)
-
-
-def test_an_orbit_smaller_than_the_vehicle_may_be_asked_for():
-    assert orbit(straight(), 12, 5.0, 0.5, None)[1] == 0.5
 
 
 def test_which_way_is_up():
@@ -362,19 +360,18 @@ def test_length_and_rate_can_be_chosen(scene, tmp_path):
     assert len(cameras) == 45 and path["seconds"] == 1.5
     path, cameras = film(scene, tmp_path, fps=30.0)
     assert len(cameras) == 61 and path["fps"] == 30
+    # the viewer finds its keyframes
+    assert len(path["keyframes"]) == 12
+    assert path["keyframes"][0]["matrix"] == path["camera_path"][0]["camera_to_world"]
+    assert path["keyframes"][-1]["matrix"] == path["camera_path"][-1]["camera_to_world"]
+    assert path["default_transition_sec"] * 11 == pytest.approx(path["seconds"])
     no_times = write_scene(tmp_path / "no_times", frames=5)
     path, _ = film(no_times, tmp_path)
     assert path["fps"] == 10 and len(path["camera_path"]) == 5
     with pytest.raises(InputError, match="1 pictures"):
         film(scene, tmp_path, seconds=0.2)
-
-
-def test_the_viewer_finds_its_keyframes(scene, tmp_path):
-    path, _ = film(scene, tmp_path, fps=30.0)
-    assert len(path["keyframes"]) == 12
-    assert path["keyframes"][0]["matrix"] == path["camera_path"][0]["camera_to_world"]
-    assert path["keyframes"][-1]["matrix"] == path["camera_path"][-1]["camera_to_world"]
-    assert path["default_transition_sec"] * 11 == pytest.approx(path["seconds"])
+    with pytest.raises(InputError, match="It has left, right"):
+        film(scene, tmp_path, follow="front")
 
 
 def test_it_says_how_the_film_is_made(trained, tmp_path):
@@ -445,11 +442,6 @@ def test_settings_that_are_none(tmp_path):
         config.write_text(text)
         with pytest.raises(InputError, match=r"config\.yml that ns-train wrote"):
             write_camera_path(CameraPathOptions(load_config=config), QUIET)
-
-
-def test_a_camera_that_is_not_there(scene, tmp_path):
-    with pytest.raises(InputError, match="It has left, right"):
-        film(scene, tmp_path, follow="front")
 
 
 @pytest.mark.parametrize(
