@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,13 +31,8 @@ from edge_depth_nerf.jobs.runs import command_line
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.report import views
-from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, build_report, write_report
-from edge_depth_nerf.report.compared_views import (
-    BY_VIEW,
-    DISTANCE_KEYS,
-    ComparedView,
-    held_out_frames,
-)
+from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, write_report
+from edge_depth_nerf.report.compared_views import BY_VIEW, DISTANCE_KEYS, ComparedView, held_out_frames
 from edge_depth_nerf.report.points import ShownPoints, show_points
 from edge_depth_nerf.report.tables import Cell, MadeTable, Row
 from edge_depth_nerf.report.views import KINDS, ShownDrive, ShownView, encode, make_drives, show_view, spread
@@ -127,7 +123,7 @@ def test_lidar_points_are_spread_so_that_they_can_be_seen():
 
 
 def test_pictures_are_small():
-    noise = np.random.default_rng(0).integers(0, 255, (1400, 1400, 3), dtype=np.uint8)
+    noise = np.random.default_rng(0).integers(0, 255, (700, 700, 3), dtype=np.uint8)
     allowance = views.PICTURES_BYTES // views.MOST_PICTURES
     mask, distance_m = np.ones(noise.shape[:2], bool), np.full(noise.shape[:2], 9, np.float32)
     colours = {"m": noise[::-1].copy()}
@@ -235,7 +231,6 @@ def test_a_broken_cloud_costs_the_view_in_3d_alone(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "options"),
     [
-        (("demo",), DemoOptions()),
         (("demo",), DemoOptions(output=Path("my folder/it's"), frames=13, scene="turn")),
         (("demo",), DemoOptions(real=Path("my drive"), steps=9)),
         (
@@ -259,8 +254,6 @@ def test_a_broken_cloud_costs_the_view_in_3d_alone(tmp_path, capsys):
     ],
 )
 def test_a_command_gives_its_options_again(words, options):
-    import shlex
-
     program, *arguments = shlex.split(command_line(["edge-depth-nerf", *words], options))
     assert program == "edge-depth-nerf"
     found = tyro.cli(cli.Command, prog=program, args=arguments)
@@ -351,8 +344,19 @@ def report(cloud) -> Report:
     )
 
 
-def test_text_is_escaped(report):
-    text = build_report(report)
+@pytest.fixture(scope="module")
+def written(report, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    write_report(path, report)
+    return path
+
+
+@pytest.fixture(scope="module")
+def text(written) -> str:
+    return written.read_text(encoding="utf-8")
+
+
+def test_text_is_escaped(text):
     page = Page(text)
     assert "<script>window.hacked" not in text and "onerror='" not in re.sub(r'"[^"]*"', "", text)
     assert [attributes for tag, attributes in page.tags if tag == "script"] == [
@@ -368,8 +372,7 @@ def test_text_is_escaped(report):
     assert len(pictures["drives"][0]["views"]) == 3
 
 
-def test_the_page_loads_nothing(report):
-    text = build_report(report)
+def test_the_page_loads_nothing(text):
     page = Page(text)
     loads = [
         attributes[name]
@@ -386,8 +389,8 @@ def test_the_page_loads_nothing(report):
     assert "http" not in re.sub(r"data:image/[^\"]*", "", text).replace("http-equiv", "")
 
 
-def test_only_its_own_script_and_style_count(report):
-    page = Page(build_report(report))
+def test_only_its_own_script_and_style_count(text):
+    page = Page(text)
     (policy,) = (entry["content"] for tag, entry in page.tags if tag == "meta" and "http-equiv" in entry)
     parts = dict(part.strip().split(" ", 1) for part in policy.split(";"))
     assert parts["default-src"] == parts["base-uri"] == parts["form-action"] == "'none'"
@@ -401,8 +404,8 @@ def test_every_method_has_a_line_of_its_own():
     assert len({style_of(name) for name in METHODS}) == len(METHODS)
 
 
-def test_plots_are_svg_in_two_colours():
-    plot = small_plot()
+def test_plots_are_svg_in_two_colours(report):
+    (plot,) = report.plots
     for content in (plot.light, plot.dark):
         root = ElementTree.fromstring(content)
         assert root.tag == "{http://www.w3.org/2000/svg}svg"
@@ -430,15 +433,8 @@ def test_the_page_is_written_whole_or_not_at_all(report, tmp_path, monkeypatch):
 
 
 # --- the page in a browser --------------------------------------------------------------------------------------------
-@pytest.fixture(scope="module")
-def address(report, tmp_path_factory) -> str:
-    path = tmp_path_factory.mktemp("report") / "report.html"
-    write_report(path, report)
-    return path.as_uri()
-
-
 @pytest.fixture
-def opened(browser, address):
+def opened(browser, written):
     """Opens the page from disk, without network; in the end there was no error and no request for anything else."""
     contexts, wrong = [], []
 
@@ -451,11 +447,11 @@ def opened(browser, address):
         page.on("dialog", lambda dialog: wrong.append(f"dialog: {dialog.message}"))
 
         def on_request(request: Any) -> None:
-            if request.url != address and not request.url.startswith("data:"):
+            if request.url != written.as_uri() and not request.url.startswith("data:"):
                 wrong.append(f"request: {request.url}")
 
         page.on("request", on_request)
-        page.goto(address)
+        page.goto(written.as_uri())
         return page
 
     yield open_page
@@ -573,7 +569,20 @@ def test_the_keyboard_does_everything(opened):
 
 def test_methods_kinds_and_drives_switch(opened):
     page = opened()
+    # an error names what stands beside it
+    tags = page.locator(".tag")
+    assert tags.all_inner_texts() == ["first", NASTY]
+    page.get_by_label("Left", exact=True).select_option(label="ground truth")
+    page.get_by_role("radio", name="Distance error").check(force=True)
+    assert tags.all_inner_texts() == ["ground truth: distance", f"{NASTY}: distance error"]
+    assert page.locator(".scale").evaluate_all("(all) => all.map((each) => each.firstChild.textContent)") == [
+        *("Distance", "Distance error")
+    ]
+    assert page.locator(".ticks").all_inner_texts()[0].endswith("60 m")
     page.get_by_label("Left", exact=True).select_option(label="first")
+    assert tags.all_inner_texts() == ["first", NASTY] and page.locator(".legend").count() == 1
+
+    page.get_by_role("radio", name="Distance", exact=True).check(force=True)
     assert colour_of(pixel(page, 0.25)) == "green" and colour_of(pixel(page, 0.75)) == "blue"
     page.get_by_label("Right", exact=True).select_option(label="ground truth")
     assert colour_of(pixel(page, 0.75)) == "red"
@@ -597,24 +606,19 @@ def test_methods_kinds_and_drives_switch(opened):
     assert page.get_by_label("Left", exact=True).locator("option:checked").inner_text() == "first"
 
 
-def test_an_error_names_what_stands_beside_it(opened):
-    page = opened()
-    tags = page.locator(".tag")
-    assert tags.all_inner_texts() == ["first", NASTY]
-    page.get_by_label("Left", exact=True).select_option(label="ground truth")
-    page.get_by_role("radio", name="Distance error").check(force=True)
-    assert tags.all_inner_texts() == ["ground truth: distance", f"{NASTY}: distance error"]
-    assert page.locator(".scale").evaluate_all("(all) => all.map((each) => each.firstChild.textContent)") == [
-        *("Distance", "Distance error")
-    ]
-    assert page.locator(".ticks").all_inner_texts()[0].endswith("60 m")
-    page.get_by_label("Left", exact=True).select_option(label="first")
-    assert tags.all_inner_texts() == ["first", NASTY] and page.locator(".legend").count() == 1
-
-
 def space(page: Any) -> np.ndarray:
     shot = page.locator(".space canvas").screenshot()
     return cv2.imdecode(np.frombuffer(shot, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+
+
+def wait_for_frames(page: Any, count: int) -> None:
+    """So many pictures of the view are drawn."""
+    page.evaluate(
+        "(count) => new Promise((done) => {"
+        " const next = () => (count-- ? requestAnimationFrame(next) : done());"
+        " next(); })",
+        count,
+    )
 
 
 def red(picture: np.ndarray) -> np.ndarray:
@@ -622,13 +626,13 @@ def red(picture: np.ndarray) -> np.ndarray:
 
 
 def test_points_are_seen_in_3d(opened, cloud):
-    page = opened()
+    page = opened(800, 600)
     canvas = page.locator(".space canvas")
     assert canvas.get_attribute("data-points") is None  # nothing is drawn before it is seen
     canvas.scroll_into_view_if_needed()
     page.locator(".space canvas[data-points]").wait_for()
     assert canvas.get_attribute("data-points") == str(len(cloud.steps))
-    page.wait_for_timeout(500)
+    wait_for_frames(page, 3)
     first = space(page)
     assert red(first).sum() > 500  # the wall
 
@@ -638,16 +642,16 @@ def test_points_are_seen_in_3d(opened, cloud):
     page.mouse.down()
     page.mouse.move(middle[0] + 150, middle[1], steps=5)
     page.mouse.up()
-    page.wait_for_timeout(2500)
+    wait_for_frames(page, 25)  # until the movement has died away
     dragged = space(page)
     assert (red(first) != red(dragged)).sum() > 300
     page.keyboard.press("ArrowLeft")  # it has the focus now
     for _ in range(4):
         page.keyboard.press("+")
-    page.wait_for_timeout(500)
+    wait_for_frames(page, 3)
     assert (red(dragged) != red(space(page))).sum() > 300
     page.get_by_role("button", name="First view").click()
-    page.wait_for_timeout(500)
+    wait_for_frames(page, 3)
     assert (red(first) != red(space(page))).sum() < 100
 
     # another drive has no points
@@ -655,16 +659,10 @@ def test_points_are_seen_in_3d(opened, cloud):
     assert not page.locator("#points").is_visible()
 
 
-def test_on_a_phone_the_choices_stand_above_the_picture(opened):
+def test_on_a_phone_the_choices_stand_above_the_picture_and_tables_and_plots_fit(opened):
     page = opened(390, 844)
     places = [page.locator(each).bounding_box()["y"] for each in (".choices", ".sides", ".stage", ".thumbnails")]
     assert places == sorted(places)
-    desk = opened()
-    assert desk.locator(".choices").bounding_box()["x"] > desk.locator(".stage").bounding_box()["x"] + 400
-
-
-def test_tables_and_plots_fit_a_phone(opened):
-    page = opened(390, 844)
     tables = page.locator(".tall")
     assert tables.count() == 2 and tables.first.is_visible()
     wide = page.locator(".or-tall .scroll")
@@ -676,31 +674,37 @@ def test_tables_and_plots_fit_a_phone(opened):
     # a plot is slid nowhere, and not shrunk until nobody can read it
     assert page.locator(".plot .scroll").evaluate("(each) => each.scrollWidth <= each.clientWidth")
     assert page.locator(".plot img").evaluate("(image) => image.clientWidth / image.naturalWidth") > 0.7
-    desk = opened()
-    assert not any(each.is_visible() for each in desk.locator(".tall").all())
+    page.set_viewport_size({"width": 1280, "height": 900})
+    assert not any(each.is_visible() for each in page.locator(".tall").all())
+    assert page.locator(".choices").bounding_box()["x"] > page.locator(".stage").bounding_box()["x"] + 400
 
 
-@pytest.mark.parametrize("width", [320, 360, 600, 900])
-def test_nothing_is_wider_than_the_window(opened, width):
-    page = opened(width, 740)
+def test_nothing_is_wider_than_the_window(opened):
+    page = opened(900, 740)
     page.evaluate("document.querySelectorAll('details').forEach((each) => (each.open = true))")
-    assert page.evaluate("document.documentElement.scrollWidth") == width
-    page.evaluate("window.scrollTo(500, 0)")
-    assert page.evaluate("window.scrollX") == 0
-    # wide tables are slid by themselves, and the keyboard reaches them
-    wide = page.locator(".scroll").first
-    assert wide.evaluate("(each) => each.scrollWidth >= each.clientWidth && each.tabIndex === 0")
-    assert page.locator(".stage").bounding_box()["width"] > 0.6 * min(width, 640)
+    for width in (900, 600, 360, 320):
+        page.set_viewport_size({"width": width, "height": 740})
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        page.evaluate("window.scrollTo(500, 0)")
+        assert page.evaluate("window.scrollX") == 0
+        # wide tables are slid by themselves, and the keyboard reaches them
+        wide = page.locator(".scroll").first
+        assert wide.evaluate("(each) => each.scrollWidth >= each.clientWidth && each.tabIndex === 0")
+        assert page.locator(".stage").bounding_box()["width"] > 0.6 * min(width, 640)
 
 
 def test_it_is_dark_where_the_system_is(opened):
-    def look(page: Any) -> tuple[float, str]:
-        colour = page.evaluate("getComputedStyle(document.body).backgroundColor")
-        return float(np.mean([int(each) for each in re.findall(r"\d+", colour)])), page.evaluate(
-            "document.querySelector('.plot img').currentSrc"
-        )
+    page = opened(color_scheme="light")
 
-    light, dark = look(opened(color_scheme="light")), look(opened(color_scheme="dark"))
+    def look() -> tuple[float, str]:
+        colour = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        shade = float(np.mean([int(each) for each in re.findall(r"\d+", colour)]))
+        return shade, page.evaluate("document.querySelector('.plot img').currentSrc")
+
+    light = look()
+    page.emulate_media(color_scheme="dark")
+    page.wait_for_function("(light) => document.querySelector('.plot img').currentSrc !== light", arg=light[1])
+    dark = look()
     assert light[0] > 220 and dark[0] < 40
     assert light[1] != dark[1]
 
