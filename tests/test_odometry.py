@@ -195,7 +195,7 @@ def blind(request, tmp_path_factory) -> ProcessOptions:
     with pytest.MonkeyPatch.context() as patch:
         # KITTI-360's own scanner measures four times as many points
         patch.setattr(DriveLayout, "scanner", Scanner.turning(2.0, -24.8, 64, 450, VELO_TO_POSE))
-        synthesize_coarsely(SynthesizeOptions(root, "parking", frames=5, size=64, layout=request.param))
+        synthesize_coarsely(SynthesizeOptions(root, "parking", frames=7, size=64, layout=request.param))
     for path in (*root.rglob("poses.txt"), *root.rglob("cam0_to_world.txt")):
         path.unlink()
     for path in root.glob("*.toml"):
@@ -215,13 +215,13 @@ def test_a_drive_without_poses_becomes_a_scene(blind, monkeypatch):
     without_lidar_check(monkeypatch)
     report = process_recording(read_drive(blind), blind, QUIET)
     notices = " ".join(report.notices)
-    # every sweep is followed, not only those of the frames asked for: 0.4 s at some 4 m/s
-    length = re.search(r"followed 5 sweeps of \w+: the path is ([0-9.]+) m long", notices)
-    assert length is not None and 1.47 < float(length[1]) < 1.8
+    # every sweep is followed, not only those of the frames asked for: 0.6 s at some 4 m/s
+    length = re.search(r"followed 7 sweeps of \w+: the path is ([0-9.]+) m long", notices)
+    assert length is not None and 2.2 < float(length[1]) < 2.7
     assert "epipolar curves" in notices or "Too few features match" in notices
     assert not report.skipped
     scene = read_scene(blind.output)
-    assert len(scene.frames()) == 3
+    assert len(scene.frames()) == 4
     assert scene.has("lidar")
 
 
