@@ -47,11 +47,14 @@ def test_a_change_of_a_function_reaches_those_that_call_it(tmp_path):
     assert [[int(each) for each in line.split()] for line in done.stdout.splitlines()] == [[2, 0], [21, 0], [22, 1]]
 
 
-def test_what_a_training_calls_is_looked_at_before_it_is_called():
+def test_what_a_training_calls_is_looked_at_before_it_is_called(monkeypatch):
     """A process that has computed no prior has not imported it."""
-    code = (
-        "from edge_depth_nerf.kernels import compiled; from edge_depth_nerf.plugin.fused.build import compiled_before\n"
-        "print(len(compiled._folders)); compiled_before(); print(len(compiled._folders))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-    assert [int(count) for count in done.stdout.split()] == [0, 2]  # kernels and method
+    from edge_depth_nerf.plugin.fused.build import compiled_before
+
+    for name in [name for name in sys.modules if name.startswith("edge_depth_nerf.") and name.endswith("_numba")]:
+        package, _, module = name.rpartition(".")
+        monkeypatch.delitem(sys.modules, name)
+        monkeypatch.delattr(sys.modules[package], module)
+    monkeypatch.setattr(compiled, "_folders", set())
+    compiled_before()
+    assert len(compiled._folders) == 2  # kernels and method

@@ -11,19 +11,20 @@ from edge_depth_nerf import entry
 from edge_depth_nerf.kernels import openmp
 
 BURNT = """
-import os, sys, time
+import os, time
 import torch
 from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
 torch.set_num_threads(len(os.sched_getaffinity(0)))
-if sys.argv[1] == "sleeping":
-    assert let_idle_threads_sleep() and let_idle_threads_sleep()  # once more does nothing
 numbers = torch.zeros(1 << 17)
-numbers.add_(1.0)
-started = time.process_time()
-for _ in range(60):
+for sleeping in (False, True):
+    if sleeping:
+        assert let_idle_threads_sleep() and let_idle_threads_sleep()  # once more does nothing
     numbers.add_(1.0)
-    time.sleep(0.005)
-print(time.process_time() - started)
+    started = time.process_time()
+    for _ in range(60):
+        numbers.add_(1.0)
+        time.sleep(0.005)
+    print(time.process_time() - started)
 """
 
 
@@ -39,28 +40,18 @@ def in_gnu_openmp_with_threads() -> bool:
 def test_idle_threads_do_not_burn_the_processor():
     """60 short additions with pauses: the work is next to nothing, what the threads burn in the pauses is not."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))}
-    burnt = {}
-    for way in ("turning", "sleeping"):
-        done = subprocess.run(
-            [sys.executable, "-c", BURNT, way], capture_output=True, text=True, timeout=120, env=environment
-        )
-        assert done.returncode == 0, done.stderr
-        burnt[way] = float(done.stdout)
-    assert burnt["sleeping"] < burnt["turning"] / 3, burnt
+    done = subprocess.run([sys.executable, "-c", BURNT], capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode == 0, done.stderr
+    turning, sleeping = map(float, done.stdout.split())
+    assert sleeping < turning / 3
 
 
-@pytest.mark.parametrize("name", ["OMP_WAIT_POLICY", "GOMP_SPINCOUNT"])
-def test_what_the_environment_says_stays(monkeypatch, name):
+@pytest.mark.parametrize(("name", "threads"), [("OMP_WAIT_POLICY", 4), ("GOMP_SPINCOUNT", 4), ("OTHER", 1)])
+def test_what_the_environment_says_stays_and_one_thread_has_nothing_to_wait_for(monkeypatch, name, threads):
+    for each in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"):
+        monkeypatch.delenv(each, raising=False)
     monkeypatch.setenv(name, "active")
-    monkeypatch.setattr(openmp.torch, "get_num_threads", lambda: 4)
-    monkeypatch.setattr(openmp.threading, "Thread", lambda **_: pytest.fail("made a thread"))
-    assert not openmp.let_idle_threads_sleep()
-
-
-def test_one_thread_has_nothing_to_wait_for(monkeypatch):
-    for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(openmp.torch, "get_num_threads", lambda: 1)
+    monkeypatch.setattr(openmp.torch, "get_num_threads", lambda: threads)
     monkeypatch.setattr(openmp.threading, "Thread", lambda **_: pytest.fail("made a thread"))
     assert not openmp.let_idle_threads_sleep()
 
@@ -68,10 +59,8 @@ def test_one_thread_has_nothing_to_wait_for(monkeypatch):
 def test_our_commands_and_theirs_begin_with_it(monkeypatch):
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
     monkeypatch.setattr(sys, "argv", ["edge-depth-nerf", "--no-such-option"])
-    with pytest.raises(SystemExit):
-        entry.main()
-    assert os.environ["OMP_WAIT_POLICY"] == "passive"
-    monkeypatch.setenv("OMP_WAIT_POLICY", "active")
-    with pytest.raises(SystemExit):
-        entry.main()
-    assert os.environ["OMP_WAIT_POLICY"] == "active"
+    for policy in ("passive", "active"):
+        with pytest.raises(SystemExit):
+            entry.main()
+        assert os.environ["OMP_WAIT_POLICY"] == policy
+        monkeypatch.setenv("OMP_WAIT_POLICY", "active")
