@@ -5,6 +5,8 @@ The functions are called on CPU tensors; each launch compiles its kernel for the
 
 import re
 import subprocess
+import sysconfig
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ from unittest import mock
 
 ARCHITECTURES = (80, 89, 90)
 """A100, RTX 40 and L40, H100 and H200."""
+PROGRAMS = Path(sysconfig.get_path("purelib")) / "triton/backends/nvidia/bin"
 
 
 @dataclass(frozen=True)
@@ -24,8 +27,12 @@ class Kernel:
     name: str
     registers: int
     spilled: int
-    shared: int
-    instructions: dict[str, int]
+    program: Path
+
+    def instructions(self) -> dict[str, int]:
+        """How often it has each, by their names; read by a program that takes half a second."""
+        code = subprocess.run([PROGRAMS / "nvdisasm", self.program], capture_output=True, text=True, check=True).stdout
+        return Counter(re.findall(r"^\s+/\*[0-9a-f]+\*/\s+(?:@!?U?P\w+\s+)?([A-Z][\w.]*)", code, re.MULTILINE))
 
 
 @contextmanager
@@ -72,21 +79,14 @@ def check_registers(
 
 def compiled(call: Callable[[], Any], architecture: int, folder: Path) -> list[Kernel]:
     """Compile what a call launches."""
-    import triton
-
     with _compiling_for(architecture) as found:
         call()
-    programs = Path(triton.__file__).parent / "backends/nvidia/bin"
     kernels = []
     for name, program in found.items():
-        path = folder / "kernel.cubin"
+        path = folder / f"{name}.cubin"
         path.write_bytes(program)
-        use = subprocess.run([programs / "cuobjdump", "-res-usage", path], capture_output=True, text=True, check=True)
-        code = subprocess.run([programs / "nvdisasm", path], capture_output=True, text=True, check=True).stdout
-        (sizes,) = re.findall(r"REG:(\d+) STACK:(\d+) SHARED:(\d+) LOCAL:(\d+)", use.stdout)
-        registers, stack, shared, local = map(int, sizes)
-        instructions: dict[str, int] = {}
-        for each in re.findall(r"^\s+/\*[0-9a-f]+\*/\s+(?:@!?U?P\w+\s+)?([A-Z][\w.]*)", code, re.MULTILINE):
-            instructions[each] = instructions.get(each, 0) + 1
-        kernels.append(Kernel(name, registers, stack + local, shared, instructions))
+        use = subprocess.run([PROGRAMS / "cuobjdump", "-res-usage", path], capture_output=True, text=True, check=True)
+        (sizes,) = re.findall(r"REG:(\d+) STACK:(\d+) SHARED:\d+ LOCAL:(\d+)", use.stdout)
+        registers, stack, local = map(int, sizes)
+        kernels.append(Kernel(name, registers, stack + local, path))
     return kernels

@@ -8,7 +8,7 @@ import pytest
 import reference
 import torch
 from ahead_of_time import ARCHITECTURES, check_registers
-from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, on_a_gpu
+from interpreted import NEEDS_A_GPU, assert_near, on_a_gpu
 
 from edge_depth_nerf.method import depth_losses, edge_loss_numba
 from edge_depth_nerf.method.depth_losses import EdgeLoss, Level
@@ -89,30 +89,28 @@ def check_what_is_not_finite(kernels: Any = None) -> None:
     assert by_kernels(given, kernels=kernels).isnan().tolist() == [False] * 8 + [True]
 
 
-@pytest.mark.slow
-def test_in_the_interpreter():
-    pytest.importorskip("triton")
-    in_interpreter(check_values_and_gradients, check_nothing_to_look_at, check_what_is_not_finite)
+CHECKS = check_values_and_gradients, check_nothing_to_look_at, check_what_is_not_finite
+"""In Triton's interpreter test_back_ends.py runs them, those of all kernels in one process."""
 
 
-@pytest.mark.parametrize("check", [check_values_and_gradients, check_nothing_to_look_at, check_what_is_not_finite])
+@pytest.mark.parametrize("check", CHECKS)
 def test_the_same_on_the_cpu(check):
     check(edge_loss_numba)
 
 
 @NEEDS_A_GPU
 def test_the_same_on_a_gpu():
-    on_a_gpu(check_values_and_gradients, check_nothing_to_look_at, check_what_is_not_finite)
+    on_a_gpu(*CHECKS)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
-@pytest.mark.parametrize("gaussian", ["point", "interval"])
-def test_compiled_without_spills(gaussian, architecture, tmp_path):
+def test_compiled_without_spills(architecture, tmp_path):
     pytest.importorskip("triton")
 
     def step() -> None:
-        by_kernels(level_of(16, 256), gaussian).sum().backward()
+        for gaussian in ("point", "interval"):
+            by_kernels(level_of(16, 256), gaussian).sum().backward()
 
     check_registers(step, architecture, tmp_path, {"_loss_kernel"}, 64)
 

@@ -7,7 +7,9 @@ from typing import Any
 import pytest
 import torch
 from ahead_of_time import ARCHITECTURES, check_registers
-from interpreted import NEEDS_A_GPU, assert_near, in_interpreter, moved_in_interpreter, on_a_gpu
+from interpreted import NEEDS_A_GPU, assert_near, moved_in_interpreter, on_a_gpu
+
+from edge_depth_nerf.kernels import formulas
 
 SIZES = ((1, 1), (5, 17), (33, 49), (3, 256), (7, 300))
 """Rays and samples, of which few are multiples of what a program works on."""
@@ -70,13 +72,11 @@ def check_densities() -> None:
 
 
 def check_harmonics() -> None:
-    from nerfstudio.utils.math import components_from_spherical_harmonics
-
+    """Against the formula that test_back_ends.py compares with nerfstudio's."""
     kernels = by_triton()
     for count in (1, 255, 700):
         directions = torch.nn.functional.normalize(torch.randn(count, 4)[:, :3], dim=1)
-        exact = (directions.double() + 1) / 2
-        expected = components_from_spherical_harmonics(4, exact)
+        expected = formulas.harmonics(directions.double())
         for dtype, tolerance in ((torch.float32, 1e-6), (torch.float16, 5e-4)):
             found = kernels.harmonics(directions, dtype)
             assert found.dtype == dtype
@@ -100,21 +100,19 @@ def check_contraction() -> None:
     assert [each.shape for each in pointwise_triton.contract(x[:0])] == [(0, 3), (0,)]
 
 
+CHECKS = check_distances, check_contraction, check_densities, check_harmonics
+
+
 @pytest.mark.slow
 def test_in_the_interpreter():
+    """With all memory copied there and back at each launch, as on a GPU."""
     pytest.importorskip("triton")
-    in_interpreter(check_distances, check_contraction, check_densities, check_harmonics)
+    moved_in_interpreter(*CHECKS)
 
 
 @NEEDS_A_GPU
 def test_the_same_on_a_gpu():
-    on_a_gpu(check_distances, check_contraction, check_densities, check_harmonics)
-
-
-@pytest.mark.slow
-def test_memory_goes_there_and_back_as_it_lies():
-    pytest.importorskip("triton")
-    moved_in_interpreter(check_distances, check_densities, check_harmonics)
+    on_a_gpu(*CHECKS)
 
 
 @pytest.mark.slow
