@@ -22,17 +22,44 @@ def edit(folder, change):
         change(meta)
 
 
-def test_positions_are_metres_over_metres_per_unit(tmp_path):
-    scene = write_scene(tmp_path)
-    meta = read_json(scene / "transforms.json")
-    outputs = parse(scene, metres_per_unit=20.0, center_method="none")
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """A scene that no test changes."""
+    return write_scene(tmp_path_factory.mktemp("shared"))
+
+
+def test_positions_are_metres_over_metres_per_unit(shared):
+    meta = read_json(shared / "transforms.json")
+    outputs = parse(shared, metres_per_unit=20.0, center_method="none")
     expected = [f["transform_matrix"] for f in meta["frames"] if f["file_path"] in meta["train_filenames"]]
     expected = np.array(expected)[:, :3]
     expected[:, :, 3] /= 20
     assert np.allclose(outputs.cameras.camera_to_worlds, expected, atol=1e-6)
     assert outputs.metadata["metres_per_unit"] == 20
     assert outputs.dataparser_scale == pytest.approx(1 / 20)
-    assert len(parse(scene, "test").image_filenames) == 1
+    # maps follow the pictures
+    names = [path.name for path in outputs.image_filenames]
+    assert names == [f"{i:04d}.png" for i in (0, 1, 2, 3, 5, 6, 7, 8)]
+    for layer in ("image", "lidar", "mono", "truth_distance", "truth_rgb"):
+        assert [picture.files[layer].name for picture in outputs.metadata["pictures"]] == names
+    assert len(parse(shared, "test").image_filenames) == 1
+
+
+BENT = Pinhole(32, 28, 20.0, 20.5, 16.0, 14.0, 0.01, 0.02, 1e-3, 2e-3, 0.03, 0.01)
+
+
+@pytest.mark.parametrize("camera", [fisheye(), BENT])
+def test_lenses_keep_their_kind_and_all_their_terms(tmp_path, camera):
+    outputs = parse(write_scene(tmp_path, [camera], frames=2))
+    kind = CameraType.FISHEYE if camera.model == "KANNALA_BRANDT" else CameraType.PERSPECTIVE
+    assert (outputs.cameras.camera_type == kind.value).all()
+    pixels = camera.pixel_centres()
+    expected, valid = camera.unproject(pixels)
+    ours, _ = FisheyeDepthDataset(outputs).camera(0).unproject(pixels)
+    assert torch.allclose(ours[valid], expected[valid], atol=1e-6)
+    rays = outputs.cameras[0].generate_rays(camera_indices=0, coords=pixels.flip(-1).float())
+    in_world = (ours * torch.tensor([1.0, -1.0, -1.0])) @ outputs.cameras.camera_to_worlds[0].double()[:, :3].T
+    assert torch.allclose(rays.directions.double()[valid], in_world[valid], atol=1e-5)
 
 
 def test_the_default_scale_says_metres():
@@ -85,26 +112,6 @@ def test_no_orientation_turns_a_picture(tmp_path):
     assert np.array_equal(dataset.get_numpy_image(0), pixels)
 
 
-def test_maps_follow_the_pictures(tmp_path):
-    outputs = parse(write_scene(tmp_path), "train")
-    names = [path.name for path in outputs.image_filenames]
-    assert names == [f"{i:04d}.png" for i in (0, 1, 2, 3, 5, 6, 7, 8)]
-    for layer in ("image", "lidar", "mono", "truth_distance", "truth_rgb"):
-        assert [picture.files[layer].name for picture in outputs.metadata["pictures"]] == names
-
-
-@pytest.mark.parametrize("camera", [fisheye(), pinhole()])
-def test_lenses_keep_their_kind(tmp_path, camera):
-    scene = write_scene(tmp_path, [camera])
-    outputs = parse(scene)
-    kind = CameraType.FISHEYE if camera.model == "KANNALA_BRANDT" else CameraType.PERSPECTIVE
-    assert (outputs.cameras.camera_type == kind.value).all()
-    dataset = FisheyeDepthDataset(outputs)
-    ours, _ = dataset.camera(0).unproject(camera.pixel_centres())
-    original, valid = camera.unproject(camera.pixel_centres())
-    assert torch.allclose(ours[valid], original[valid], atol=1e-6)
-
-
 def test_a_plain_nerfstudio_scene_counts_as_lidar_and_z_becomes_distance(tmp_path):
     """nerfstudio's own scenes: millimetres of z-depth under depth_file_path."""
     camera = pinhole()
@@ -140,17 +147,13 @@ def test_the_mask_ends_where_the_lens_does(tmp_path):
     mask = dataset[0]["mask"][..., 0].numpy()
     assert np.array_equal(mask, known.numpy() & (theta_deg <= 60))
     assert 0 < mask.sum() < mask.size
+    # the scene's own lies within it
+    masked = FisheyeDepthDataset(parse(write_scene(tmp_path / "masked", theta_max_deg=60.0))).mask(0)
+    assert not masked[-5:].any() and np.array_equal(masked[:-5], mask[:-5])
 
 
-def test_the_scene_mask_is_within_the_lens(tmp_path):
-    dataset = FisheyeDepthDataset(parse(write_scene(tmp_path, theta_max_deg=60.0)))
-    mask = dataset.mask(0)
-    assert not mask[-5:].any()
-    assert np.array_equal(mask[:-5], dataset.rays(0).within[:-5])
-
-
-def test_an_item_evaluates(tmp_path):
-    item = FisheyeDepthDataset(parse(write_scene(tmp_path), "test"))[0]
+def test_an_item_evaluates(shared):
+    item = FisheyeDepthDataset(parse(shared, "test"))[0]
     height, width = fisheye().height, fisheye().width
     assert {key: tuple(value.shape) for key, value in item.items() if key != "image_idx"} == {
         "image": (height, width, 3),
@@ -179,11 +182,6 @@ def test_another_size_is_named(tmp_path, what):
         dataset.distance_m(0, "mono")
 
 
-def test_no_scene(tmp_path):
-    with pytest.raises(FileNotFoundError, match="edge-depth-nerf process"):
-        parse(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -202,17 +200,39 @@ def test_bad_scenes(tmp_path, change, message):
         parse(scene)
 
 
-def test_a_missing_map_is_named_before_training(tmp_path):
+def test_what_is_missing_is_named_before_training(tmp_path):
+    with pytest.raises(FileNotFoundError, match="edge-depth-nerf process"):
+        parse(tmp_path)
     scene = write_scene(tmp_path)
+    for value in (0.0, -3.0, float("nan")):
+        with pytest.raises(InputError, match="metres_per_unit"):
+            parse(scene, metres_per_unit=value)
     (scene / "lidar" / "0003.png").unlink()
     with pytest.raises(FileNotFoundError, match=r"lidar.0003\.png"):
         parse(scene)
 
 
-@pytest.mark.parametrize("value", [0.0, -3.0, float("nan")])
-def test_the_scale_must_be_positive(tmp_path, value):
-    with pytest.raises(InputError, match="metres_per_unit"):
-        parse(write_scene(tmp_path), metres_per_unit=value)
+def test_arrays_of_other_tools_say_none_in_many_ways_and_are_named_where_truncated(tmp_path):
+    scene = write_scene(tmp_path, lidar=False, mono=False, truth=False)
+    values = np.full((28, 32, 1), 2000.0, np.float32)
+    values[0, :4, 0] = np.inf, np.nan, -1, 0
+    np.save(scene / "depth.npy", values)
+
+    def change(meta):
+        for frame in meta["frames"]:
+            frame["depth_file_path"] = "depth.npy"
+        meta["depth_unit_scale_factor"] = 1e-3
+
+    edit(scene, change)
+    for factor, metres in ((1.0, 2000.0), (None, 2.0)):
+        dataset = FisheyeDepthDataset(parse(scene, **({"depth_unit_scale_factor": factor} if factor else {})))
+        found = dataset.distance_m(0, "lidar")
+        assert found is not None and found.shape == (28, 32)
+        assert found[0, :5].tolist() == pytest.approx([0, 0, 0, 0, metres])
+    path = scene / "depth.npy"
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(InputError, match=r"depth\.npy"):
+        dataset.distance_m(0, "lidar")
 
 
 def test_a_principal_point_on_a_pixel_centre_has_a_ray(tmp_path):
@@ -244,23 +264,6 @@ def test_distortion_may_be_a_list(tmp_path, of_all):
     assert ours["fx"] == outputs.cameras.fx[0] == (8.0 if of_all else 9.0)
 
 
-def test_arrays_of_other_tools_say_none_in_many_ways(tmp_path):
-    scene = write_scene(tmp_path, mono=False)
-    values = np.full((28, 32), 4000.0, np.float32)
-    values[0, :4] = np.inf, np.nan, -1, 0
-    np.save(scene / "depth.npy", values)
-
-    def change(meta):
-        for frame in meta["frames"]:
-            del frame["lidar_file_path"]
-            frame["depth_file_path"] = "depth.npy"
-        meta["depth_unit_scale_factor"] = 1e-3
-
-    edit(scene, change)
-    found = FisheyeDepthDataset(parse(scene)).distance_m(0, "lidar")
-    assert found is not None and found[0, :5].tolist() == pytest.approx([0, 0, 0, 0, 4])
-
-
 def test_a_plain_scene_of_one_picture(tmp_path):
     scene = write_scene(tmp_path, frames=1, split=False)
     for split in ("train", "test"):
@@ -287,40 +290,7 @@ def test_a_frame_is_trained_on_or_held_out_with_all_its_cameras(tmp_path):
     assert len(parse(scene, "test").image_filenames) == 9  # nothing held out
 
 
-def test_a_truncated_array_is_named(tmp_path):
-    scene = write_scene(tmp_path, lidar=False, mono=False, truth=False)
-    good = np.ones((28, 32, 1), np.float32)
-
-    def arrays(meta):
-        for frame in meta["frames"]:
-            frame["depth_file_path"] = frame["file_path"].replace("images", "depth").replace("png", "npy")
-            (scene / "depth").mkdir(exist_ok=True)
-            np.save(scene / frame["depth_file_path"], good)
-
-    edit(scene, arrays)
-    dataset = FisheyeDepthDataset(parse(scene, depth_unit_scale_factor=2.0))
-    distance = dataset.distance_m(0, "lidar")
-    assert distance is not None and distance.shape == (28, 32) and (distance == 2).all()
-    path = scene / "depth" / "0000.npy"
-    path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(InputError, match=r"0000\.npy"):
-        dataset.distance_m(0, "lidar")
-
-
-def test_another_parser_is_refused(tmp_path):
-    scene = write_scene(tmp_path)
-    outputs = NerfstudioDataParserConfig(data=scene).setup().get_dataparser_outputs("train")
+def test_another_parser_is_refused(shared):
+    outputs = NerfstudioDataParserConfig(data=shared).setup().get_dataparser_outputs("train")
     with pytest.raises(InputError, match="fisheye-depth-data"):
         FisheyeDepthDataset(outputs)
-
-
-def test_all_radial_terms_of_a_pinhole_are_read(tmp_path):
-    camera = Pinhole(32, 28, 20.0, 20.5, 16.0, 14.0, 0.01, 0.02, 1e-3, 2e-3, 0.03, 0.01)
-    outputs = parse(write_scene(tmp_path, [camera]), center_method="none")
-    dataset = FisheyeDepthDataset(outputs)
-    pixels = camera.pixel_centres()
-    rays = outputs.cameras[0].generate_rays(camera_indices=0, coords=pixels.flip(-1).float())
-    ours, _ = dataset.camera(0).unproject(pixels)
-    pose = outputs.cameras.camera_to_worlds[0].double()
-    in_world = (ours * torch.tensor([1.0, -1.0, -1.0])) @ pose[:, :3].T
-    assert torch.allclose(rays.directions.double(), in_world, atol=1e-5)

@@ -46,7 +46,8 @@ def test_every_valid_pixel_comes_once_with_its_own_prior(tmp_path, monkeypatch, 
         assert abs(sigma.item() - distance.item() / 2) <= 1 / 512 + 1e-6
         seen.add((number, row, column))
     assert len(seen) == len(table)
-    # nothing else stays behind
+    # the same pictures give the same order, and nothing else stays behind
+    assert torch.equal(table_of(tmp_path / "t.npy", masks, priors).batch(0, len(table)).indices, batch.indices)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["t.json", "t.npy"]
 
 
@@ -92,22 +93,6 @@ def test_the_order_is_random(tmp_path, monkeypatch, bucket_bytes):
     assert abs(neighbours) < 0.06  # standard deviation 0.016
 
 
-def test_the_same_pictures_give_the_same_order(tmp_path):
-    first, again = (
-        table_of(tmp_path / name, [np.ones((8, 8), bool)]).batch(0, 64).indices for name in ("a.npy", "b.npy")
-    )
-    assert np.array_equal(first, again)
-
-
-def test_the_share_with_a_prior(tmp_path):
-    mask = np.ones((100, 100), bool)
-    distance = np.where(np.arange(100) < 50, 5.0, 0.0).astype(np.float32) * np.ones((100, 1), np.float32)
-    table = table_of(tmp_path / "t.npy", [mask], [(distance, distance / 10)])
-    assert table.share_with_prior == 0.5
-    places = table.batch(0, len(table)).indices[:, 1:].numpy() @ [100, 1]
-    assert len(np.unique(places)) == 10_000
-
-
 def test_pictures_without_valid_pixels_are_never_drawn(tmp_path):
     masks = [np.zeros((3, 3), bool), np.eye(3, dtype=bool), np.zeros((3, 3), bool)]
     table = table_of(tmp_path / "t.npy", masks)
@@ -121,32 +106,21 @@ def test_no_valid_pixel_at_all(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_steps_of_a_quarter_of_a_centimetre():
+def test_what_16_bits_cannot_hold_is_no_prior_and_no_sky(tmp_path):
     metres = np.array([0, 1, 255.996, 256.0, np.nan, np.inf, -3, 1 / 256])
     assert to_steps(metres).tolist() == [0, 256, 65535, 0, 0, 0, 0, 1]
-
-
-def test_a_sigma_beyond_16_bits_stays_a_sigma(tmp_path):
-    distance = np.full((1, 4), 5, np.float32)
-    sigma = np.array([[1e-4, 1000.0, 0.5, 0.0]], np.float32)
-    batch = table_of(tmp_path / "t.npy", [np.ones((1, 4), bool)], [(distance, sigma)]).batch(0, 4)
-    stored = {int(column): float(s) for (_, _, column), s in zip(batch.indices, batch.prior_sigma_m, strict=True)}
-    assert stored == {0: 1 / 256, 1: 65535 / 256, 2: 0.5, 3: 0.0}
-
-
-def test_what_16_bits_cannot_hold_is_no_prior_and_no_sky(tmp_path):
-    distance = np.array([[255.99, 256.0, 300.0, np.inf, 5.0, 0.001, 0.0]], np.float32)
-    sigma = np.array([[256.0, 300.0, 256.0, np.inf, 1e6, 1000.0, 500.0]], np.float32)
+    distance = np.array([[255.99, 256.0, 300.0, np.inf, 5.0, 0.001, 0.0, 5.0, 5.0]], np.float32)
+    sigma = np.array([[256.0, 300.0, 256.0, np.inf, 1e6, 1000.0, 500.0, 1e-4, 0.0]], np.float32)
     mask = np.ones(distance.shape, bool)
     table = table_of(tmp_path / "t.npy", [mask], [(distance, sigma)])
-    batch = table.batch(0, 7)
-    column = batch.indices[:, 2]
+    batch = table.batch(0, 9)
+    in_order = batch.indices[:, 2].argsort()
     assert not batch.sky.any()
-    assert torch.equal(batch.prior_distance_m[:, 0] > 0, (column == 0) | (column == 4))
-    assert torch.equal(batch.prior_sigma_m[:, 0], torch.where((column == 0) | (column == 4), 65535 / 256, 0.0))
-    assert table.share_with_prior == pytest.approx(2 / 7)
+    assert (batch.prior_distance_m[in_order, 0] > 0).tolist() == [each in (0, 4, 7, 8) for each in range(9)]
+    most = 65535 / 256
+    assert batch.prior_sigma_m[in_order, 0].tolist() == [most, 0, 0, 0, most, 0, 0, 1 / 256, 0]
     # where the sky is known it stays known
-    batch = table_of(tmp_path / "sky.npy", [mask], [(distance, sigma, np.arange(7)[None] == 2)]).batch(0, 7)
+    batch = table_of(tmp_path / "sky.npy", [mask], [(distance, sigma, np.arange(9)[None] == 2)]).batch(0, 9)
     assert torch.equal(batch.sky[:, 0], batch.indices[:, 2] == 2)
 
 
