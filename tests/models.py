@@ -22,10 +22,12 @@ def shrink(model: Any, num_levels: int, log2_hashmap_size: int) -> None:
     ]
 
 
-def build(**options) -> EdgeDepthNerfModel:
-    """edge-depth-nerf-lite's model with other options; `poses`: how cameras are refined, `device`: where it will be."""
+def build(small: bool = True, **options) -> EdgeDepthNerfModel:
+    """edge-depth-nerf-lite's model, with small tables; `poses`: how cameras are refined, `device`: where it will be."""
     torch.manual_seed(0)
-    config, device = all_methods["edge-depth-nerf-lite"].pipeline.model, options.pop("device", "cpu")
+    config, device = deepcopy(all_methods["edge-depth-nerf-lite"].pipeline.model), options.pop("device", "cpu")
+    if small:
+        shrink(config, config.num_levels, 12)
     camera_optimizer = replace(config.camera_optimizer, mode=options.pop("poses", "off"))
     config = replace(config, camera_optimizer=camera_optimizer, **options)
     box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))

@@ -9,8 +9,14 @@ from edge_depth_nerf.base.files import write_distance_png
 from edge_depth_nerf.plugin.pipeline import NotFiniteError
 
 
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """A scene that no test changes, with what trainings keep beside it."""
+    return write_scene(tmp_path_factory.mktemp("shared"))
+
+
 def test_a_depth_loss_without_any_prior_is_an_error(tmp_path):
-    scene = write_scene(tmp_path, lidar=False)
+    scene = write_scene(tmp_path, lidar=False, frames=2)
     for path in (scene / "mono").iterdir():
         write_distance_png(path, np.zeros((28, 32)))
     with pytest.raises(InputError, match=r"no training pixel has a depth prior.*estimate-depth.*depth-loss none"):
@@ -20,7 +26,7 @@ def test_a_depth_loss_without_any_prior_is_an_error(tmp_path):
 
 
 def test_a_scene_without_depth_maps_is_trained_as_plain_nerfacto(tmp_path, capsys):
-    scene = write_scene(tmp_path, lidar=False, mono=False)
+    scene = write_scene(tmp_path, lidar=False, mono=False, frames=2)
     pipeline = pipeline_of(scene)
     assert "no depth maps" in (said := " ".join(capsys.readouterr().out.split())) and "this is nerfacto without" in said
     losses = pipeline.get_train_loss_dict(0)[1]
@@ -31,16 +37,16 @@ def test_a_scene_without_depth_maps_is_trained_as_plain_nerfacto(tmp_path, capsy
         config.setup(device="cpu", test_mode="val")
 
 
-def test_nothing_is_integrated_for_a_model_without_depth_loss(tmp_path, monkeypatch):
+def test_nothing_is_integrated_for_a_model_without_depth_loss(shared, monkeypatch):
     monkeypatch.setattr("edge_depth_nerf.plugin.datamanager.PriorCache", lambda *_: pytest.fail("integrated"))
-    config = pipeline_config(write_scene(tmp_path), depth_loss="none")
+    config = pipeline_config(shared, depth_loss="none")
     pipeline = config.setup(device="cpu", test_mode="val")
     assert pipeline.datamanager.config.depth_source == "none"
     assert config.datamanager.depth_source == "auto"  # what the user gave is left as it was
 
 
-def test_depth_errors_are_pooled_and_every_figure_is_finite(tmp_path):
-    pipeline = pipeline_of(write_scene(tmp_path))
+def test_depth_errors_are_pooled_and_every_figure_is_finite(shared):
+    pipeline = pipeline_of(shared)
     for metrics in (
         pipeline.get_average_eval_image_metrics(get_std=True),
         pipeline.get_eval_image_metrics_and_images(0)[0],
@@ -50,8 +56,8 @@ def test_depth_errors_are_pooled_and_every_figure_is_finite(tmp_path):
         assert np.isfinite([float(value) for value in metrics.values()]).all()
 
 
-def test_a_checkpoint_of_tiny_cuda_nn_is_refused(tmp_path):
-    pipeline = pipeline_of(write_scene(tmp_path))
+def test_a_checkpoint_of_tiny_cuda_nn_is_refused(shared):
+    pipeline = pipeline_of(shared)
     state = pipeline.state_dict()
     assert any(name.endswith("hash_table") for name in state)
     pipeline.load_pipeline(state, 0)
@@ -69,8 +75,8 @@ def counted(pipeline, steps, odd):
         pipeline.look_for_not_finite(step, {"rgb": torch.zeros(64, 3)}, losses)
 
 
-def test_on_a_gpu_several_losses_that_are_not_finite_end_a_training(tmp_path, capsys):
-    pipeline = pipeline_of(write_scene(tmp_path))
+def test_on_a_gpu_several_losses_that_are_not_finite_end_a_training(shared, capsys):
+    pipeline = pipeline_of(shared)
     counted(pipeline, (1, 2, 50), {1, 50})
     assert "In 2 of the last 50 steps a loss was not finite" in " ".join(capsys.readouterr().out.split())
     counted(pipeline, (99, 100), set())  # counted anew

@@ -17,14 +17,17 @@ from edge_depth_nerf.kernels.rendering_numba import STEEPEST, render
 from edge_depth_nerf.plugin.fused.fields import FusedNerfactoField
 
 
-@pytest.fixture(autouse=True, params=[1, 2], ids=["one thread", "two threads"])
+@pytest.fixture(autouse=True)
 def threads(request, monkeypatch):
-    """Let even a few points be shared out to several threads."""
+    """Let even a few points be shared out to several threads; two of them where a test does not say."""
     monkeypatch.setattr(rendering_numba, "LEAST_SHARE", 16)
     before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
+    torch.set_num_threads(getattr(request, "param", 2))
     yield
     torch.set_num_threads(before)
+
+
+ON_THREADS = pytest.mark.parametrize("threads", [1, 2], indirect=True, ids=["one thread", "two threads"])
 
 
 def straight_networks(x: Tensor, of_points: Tensor, first: Any, second: Any, by_ray: Tensor) -> Tensor:
@@ -37,9 +40,11 @@ def straight_networks(x: Tensor, of_points: Tensor, first: Any, second: Any, by_
     return torch.cat([density, x], dim=1).T
 
 
+@ON_THREADS
 @pytest.mark.parametrize("widths", [((24, 64, 16), (64, 64, 3)), ((5, 7), (33, 3)), ((6, 18, 20, 4), (3,))], ids=str)
-@pytest.mark.parametrize("shape", [(40, 24, 300), (50, 3, 0), (1, 7, 1), (30, 1, 30)], ids=str)
-@pytest.mark.parametrize("of_pictures", [False, True], ids=["directions", "appearance"])
+@pytest.mark.parametrize(
+    ("shape", "of_pictures"), [((40, 24, 300), True), ((50, 3, 0), False), ((1, 7, 1), True), ((30, 1, 30), False)]
+)
 def test_both_networks_and_the_rays_in_one_pass(widths, shape, of_pictures):
     torch.manual_seed(0)
     rays, samples, single_points = shape
@@ -119,6 +124,7 @@ def straight_pixels(
     return [rgb, hit, weights, single_points]
 
 
+@ON_THREADS
 @pytest.mark.parametrize("background", list(Background))
 @pytest.mark.parametrize("shape", [(37, 24, 100), (5, 1, 8), (1, 13, 1), (70, 7, 70)], ids=str)
 def test_pixels_and_their_gradients(background, shape):
@@ -160,17 +166,13 @@ def test_a_density_that_is_not_a_number_weighs_nothing_and_shows():
     assert values.grad is not None and values.grad[:, :3].isfinite().all() and values.grad[0, 3:6].isnan().any()
 
 
-def both_ways(
-    model: Any, monkeypatch: pytest.MonkeyPatch, rays: Callable[[], RayBundle] = bundle
-) -> list[dict[str, Any]]:
+def both_ways(model: Any, monkeypatch: Any, rays: Callable[[], RayBundle] = bundle) -> list[dict[str, Any]]:
     """The model's outputs as rendered at once, and step by step from the same samples."""
-    found = []
-    for at_once in (True, False):
-        if not at_once:
-            monkeypatch.setattr(FusedNerfactoField, "may_render", lambda *_: False)
-        torch.manual_seed(3)
-        found.append(model(rays()))
-    return found
+    torch.manual_seed(3)
+    at_once = model(rays())
+    monkeypatch.setattr(FusedNerfactoField, "may_render", lambda *_: False)
+    torch.manual_seed(3)
+    return [at_once, model(rays())]
 
 
 @pytest.mark.parametrize("training", [True, False], ids=["training", "evaluation"])
