@@ -25,6 +25,9 @@ from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.plugin.step_losses import distortion_loss, interlevel_loss
 
 HALVES = [torch.float16, torch.bfloat16]
+PRECISIONS = pytest.mark.parametrize(
+    ("dtype", "autocast"), [*((each, None) for each in HALVES), *((torch.float32, each) for each in (None, *HALVES))]
+)
 GAUSSIANS: tuple[Gaussian, ...] = ("point", "interval")
 
 
@@ -52,8 +55,7 @@ LOSSES = [
 
 
 @pytest.mark.parametrize("loss_of", LOSSES)
-@pytest.mark.parametrize("dtype", [*HALVES, torch.float32])
-@pytest.mark.parametrize("autocast", [None, *HALVES])
+@PRECISIONS
 def test_a_depth_loss_is_finite(loss_of: Any, dtype: torch.dtype, autocast: Any) -> None:
     edges, weights = samples(dtype)
     weights.requires_grad_()
@@ -87,8 +89,7 @@ def test_the_losses_of_samples_are_finite(dtype: torch.dtype) -> None:
 
 
 # ---- integration -----------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("dtype", [*HALVES, torch.float32])
-@pytest.mark.parametrize("autocast", [None, *HALVES])
+@PRECISIONS
 @pytest.mark.parametrize("normalise", ["pooled", "residual"])
 def test_integration_is_finite(dtype: torch.dtype, autocast: Any, normalise: Any) -> None:
     torch.manual_seed(2)
@@ -119,11 +120,12 @@ def test_maps_of_next_to_nothing(shape: tuple[int, ...]) -> None:
 
 
 # ---- hostile scenes --------------------------------------------------------------------------------------------
-def copied(folder: Path, frames: int = 6) -> Path:
-    """A camera's first frames of the sample drive."""
-    copy_sample_drive(folder)
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A camera's first frames of the sample drive that nothing was done to, with what trainings keep beside them."""
+    folder = copy_sample_drive(tmp_path_factory.mktemp("plain") / "scene")
     with transforms(folder) as meta:
-        kept = [f for f in meta["frames"] if f["camera"] == "image_02" and f["frame"] < frames]
+        kept = [f for f in meta["frames"] if f["camera"] == "image_02" and f["frame"] < 6]
         for frame in kept:
             for key in [key for key in frame if key.startswith("truth")]:
                 del frame[key]
@@ -132,6 +134,10 @@ def copied(folder: Path, frames: int = 6) -> Path:
         for key in ("train_filenames", "val_filenames", "test_filenames"):
             meta[key] = [name for name in meta[key] if name in names]
         meta.pop("shifted_views")
+    for path in folder.rglob("*.png"):
+        if path.parent.parent.name in ("images", "lidar", "mono") and f"images/image_02/{path.name}" not in names:
+            path.unlink()
+    shutil.rmtree(folder / "truth")
     return folder
 
 
@@ -147,11 +153,10 @@ def fill(kind: str, metres: float) -> Callable[[Path], None]:
     return change
 
 
-def paint(value: float | None) -> Callable[[Path], None]:
+def paint(value: int) -> Callable[[Path], None]:
     def change(scene: Path) -> None:
-        for number, path in enumerate(every(scene, "images")):
-            noise = np.random.default_rng(number).integers(0, 256, (128, 128, 3))
-            write_png(path, (noise if value is None else np.full((128, 128, 3), value)).astype(np.uint8))
+        for path in every(scene, "images"):
+            write_png(path, np.full((128, 128, 3), value, np.uint8))
 
     return change
 
@@ -214,7 +219,6 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], dict[str, Any]]] = {
     "one LiDAR return": (one_lidar_point, {}),
     "mono of nothing": (fill("mono", 0.0), {}),
     "mono far": (fill("mono", 255.9), {}),
-    "mono near": (fill("mono", 1 / 256), {}),
     "all far": (both(fill("mono", 255.9), fill("lidar", 255.9)), {}),
     "all at 4 mm": (both(fill("mono", 1 / 256), fill("lidar", 1 / 256)), {}),
     "flat maps, no alignment, literal sigma": (
@@ -222,11 +226,9 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], dict[str, Any]]] = {
         {"data__prior": PriorOptions(align="none", sigma_mode="constant"), "losses__edge": EdgeLoss(gaussian="point")},
     ),
     "masks of one pixel": (one_pixel, {}),
-    "one training picture": (one_training_picture, {}),
     "one training pixel": (both(one_training_picture, one_pixel), {}),
     "black": (paint(0), {}),
     "white": (paint(255), {}),
-    "noise": (paint(None), {}),
     "all in one place": (in_one_place, {}),
     "far from the origin": (moved(1e7, 0), {}),
     "far from each other": (moved(0, 1e6), {}),
@@ -256,18 +258,14 @@ REFUSED: dict[str, str] = {
 """Said before the first step: what is said."""
 
 
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene that nothing was done to, with what trainings keep beside it."""
-    return copied(tmp_path_factory.mktemp("plain") / "scene")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("case", HOSTILE)
 def test_a_step_on_a_hostile_scene_is_finite_or_refused(tmp_path: Path, plain: Path, case: str) -> None:
     change, options = HOSTILE[case]
-    scene = plain if change is same else copied(tmp_path / "scene")
-    change(scene)
+    scene = plain
+    if change is not same:
+        scene = Path(shutil.copytree(plain, tmp_path / "scene", ignore=shutil.ignore_patterns(".cache")))
+        change(scene)
     try:
         trainer = trainer_of(scene, tmp_path / "runs", **options)
     except InputError as error:

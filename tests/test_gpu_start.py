@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import gc
-import os
 import subprocess
 import sys
 import threading
 import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,18 +58,14 @@ print("set up")
 """
 
 
-def in_a_process(program: str, *arguments: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", program, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=240, check=False, env=dict(os.environ))
-
-
 @pytest.mark.slow
 def test_set_up_on_a_gpu_needs_no_numba_and_gives_the_priors_of_the_cpu(tmp_path):
     """With a device in Numba's place; calibration, priors, tables of pixels and of rays, a batch of evaluation."""
     from test_datamanager import manager
 
-    scene = write_scene(tmp_path / "scene")
-    done = in_a_process(WITHOUT_NUMBA, scene, tmp_path / "gpu")
+    scene = write_scene(tmp_path / "scene", frames=4)
+    command = [sys.executable, "-c", WITHOUT_NUMBA, str(scene), str(tmp_path / "gpu")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     assert done.stdout.endswith("set up\n"), done.stdout + done.stderr
     manager(scene, cache_dir=tmp_path / "cpu")
     for kind in ("pixels", "rays"):
