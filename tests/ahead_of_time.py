@@ -29,7 +29,7 @@ class Kernel:
     spilled: int
     program: Path
 
-    def instructions(self) -> dict[str, int]:
+    def instructions(self) -> Counter[str]:
         """How often it has each, by their names; read by a program that takes half a second."""
         code = subprocess.run([PROGRAMS / "nvdisasm", self.program], capture_output=True, text=True, check=True).stdout
         return Counter(re.findall(r"^\s+/\*[0-9a-f]+\*/\s+(?:@!?U?P\w+\s+)?([A-Z][\w.]*)", code, re.MULTILINE))

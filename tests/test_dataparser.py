@@ -225,7 +225,7 @@ def test_arrays_of_other_tools_say_none_in_many_ways_and_are_named_where_truncat
 
     edit(scene, change)
     for factor, metres in ((1.0, 2000.0), (None, 2.0)):
-        dataset = FisheyeDepthDataset(parse(scene, **({"depth_unit_scale_factor": factor} if factor else {})))
+        dataset = FisheyeDepthDataset(parse(scene, depth_unit_scale_factor=factor))
         found = dataset.distance_m(0, "lidar")
         assert found is not None and found.shape == (28, 32)
         assert found[0, :5].tolist() == pytest.approx([0, 0, 0, 0, metres])
