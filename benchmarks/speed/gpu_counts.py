@@ -371,8 +371,9 @@ def counted(case: str, scene: Path, folder: Path) -> dict[str, Any]:
     """Count a case, in a process that was started by `in_a_process`."""
     from edge_depth_nerf.kernels import back_ends
 
-    back_ends._tried.clear()  # as in a new process: a view may be the first that needs the kernels
     method, changes = CASES[case]
+    if changes.get("view"):
+        back_ends._tried.clear()  # as in a new process: it may be the first that needs the kernels
     gpu = FakeGpu()
     trainer = fake_trainer(gpu, method, scene, folder, **changes)
     forget_numba()
