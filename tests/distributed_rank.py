@@ -16,7 +16,7 @@ from trainings import trainer_of
 
 from edge_depth_nerf.plugin import datamanager, ray_table
 
-STEPS = 4
+STEPS = 2
 
 
 class OnCpu(DistributedDataParallel):

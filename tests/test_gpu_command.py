@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from benchmark_modules import benchmark_modules
+from scenes import copy_sample_drive, transforms
 from scipy.spatial import KDTree
 from waiting import until
 
@@ -40,6 +41,18 @@ def parts(gpu, load) -> Any:
     return load("speed.gpu_parts")
 
 
+@pytest.fixture(scope="module")
+def few_frames(tmp_path_factory) -> Path:
+    """The sample drive's held-out frame, and the one before it."""
+    scene = copy_sample_drive(tmp_path_factory.mktemp("few") / "scene")
+    with transforms(scene) as meta:
+        meta["frames"] = [frame for frame in meta["frames"] if frame["frame"] in (3, 4)]
+        names = {frame["file_path"] for frame in meta["frames"]}
+        meta["train_filenames"] = [name for name in meta["train_filenames"] if name in names]
+        meta.pop("shifted_views")
+    return scene
+
+
 def in_this_process(turns: Any, folder: Path) -> type:
     """A contestant of `turns.race` without a process of its own, which would import everything anew."""
 
@@ -57,7 +70,7 @@ def in_this_process(turns: Any, folder: Path) -> type:
     return Here
 
 
-def test_every_part_runs_to_its_end_without_a_gpu(gpu, load, sample_drive, tmp_path, capsys, monkeypatch):
+def test_every_part_runs_to_its_end_without_a_gpu(gpu, load, few_frames, tmp_path, capsys, monkeypatch):
     turns = load("speed.turns")
     monkeypatch.setattr(turns, "Contestant", in_this_process(turns, tmp_path / "race"))
     # what is counted is a test of its own
@@ -65,7 +78,7 @@ def test_every_part_runs_to_its_end_without_a_gpu(gpu, load, sample_drive, tmp_p
     # a part that did not come to its end is done anew, one that did is not
     write_json(gpu.file_of(tmp_path, "steps"), {"failed": "not done after 60 s"})
     write_json(gpu.file_of(tmp_path, "ours again"), {"steps": 5000})
-    assert gpu.main(["--fake", "--scene", str(sample_drive), "--output", str(tmp_path), "--parts", *names]) == 0
+    assert gpu.main(["--fake", "--scene", str(few_frames), "--output", str(tmp_path), "--parts", *names]) == 0
     assert "ours again: done before" in capsys.readouterr().out
     found = {name: read_json(gpu.file_of(tmp_path, name)) for name in names}
     assert not [name for name, each in found.items() if "failed" in each]
