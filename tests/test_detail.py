@@ -18,7 +18,7 @@ from edge_depth_nerf.plugin.evaluation import evaluated
 from edge_depth_nerf.plugin.exposure import Gains
 
 GREY = 0.5
-LENSES = {"fisheye": [fisheye(64, 56)], "pinhole": [pinhole(64, 56)], "both": [fisheye(64, 56), pinhole(64, 56)]}
+LENSES = {"fisheye": [fisheye(64, 56)], "both": [fisheye(64, 56), pinhole(64, 56)]}
 
 
 # ---- the formulas ---------------------------------------------------------------------------------------------------
@@ -67,16 +67,6 @@ def test_a_picture_looks_up_its_own_pixels(lens):
     # one picture, same direction, same distance: weight 1 of 1.1
     expected = (colours.reshape(-1, 3)[inside] - GREY) / 1.1
     torch.testing.assert_close(added, expected, atol=4e-3, rtol=0)
-
-
-def test_neighbours_show_what_a_grey_view_lacks():
-    lens, pose = fisheye(64, 56), at(0.5)
-    colours, distance, origins, directions, valid = seen(lens, pose)
-    around = [grey_detail(lens, at(x)) for x in (0.2, 0.8)]
-    added = carried(origins, directions, distance.flatten(), around).view(56, 64, 3)
-    inside = valid & (lens.pixel_centres() - torch.tensor([32.0, 28.0])).norm(dim=-1).lt(20)
-    before, after = (GREY - colours)[inside].abs().mean(), (GREY + added - colours)[inside].abs().mean()
-    assert after < 0.1 * before
 
 
 def test_what_a_picture_does_not_see_or_may_not_show_adds_nothing():
@@ -152,6 +142,12 @@ def test_a_picture_that_is_its_rendering_exposed_shows_nothing_beyond():
         torch.testing.assert_close(exposure.beyond(exposed, rendered, 2), more, atol=1e-5, rtol=1e-4)
 
 
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """One that no test changes, with what trainings keep beside it."""
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
 # ---- in the model ---------------------------------------------------------------------------------------------------
 def grey_ball(pipeline, monkeypatch):
     """Let a model render the scene's ball in grey, at its true distance; give the numbers of rays that it rendered."""
@@ -199,8 +195,7 @@ def test_a_grey_model_shows_the_colours_of_its_training_pictures(tmp_path, monke
     assert before > 0.15 and after < 0.25 * before
 
 
-def test_the_option_shows_it_and_is_off_by_default(tmp_path, monkeypatch):
-    scene = write_scene(tmp_path)
+def test_the_option_shows_it_and_is_off_by_default(scene, monkeypatch):
     for option in (False, True):
         pipeline = pipeline_of(scene, detail=True) if option else pipeline_of(scene)
         grey_ball(pipeline, monkeypatch)
@@ -215,8 +210,8 @@ def test_the_option_shows_it_and_is_off_by_default(tmp_path, monkeypatch):
         assert (figures["masked_psnr"] > 14) is option
 
 
-def test_training_never_shows_it_and_cut_views_do_not(tmp_path, monkeypatch):
-    pipeline = pipeline_of(write_scene(tmp_path), detail=True)
+def test_training_never_shows_it_and_cut_views_do_not(scene, monkeypatch):
+    pipeline = pipeline_of(scene, detail=True)
     rendered = grey_ball(pipeline, monkeypatch)
     model, camera = pipeline.model, pipeline.datamanager.eval_dataset.cameras[:1]
     model.train()
@@ -226,8 +221,8 @@ def test_training_never_shows_it_and_cut_views_do_not(tmp_path, monkeypatch):
     assert sum(rendered) == 2 * 28 * 32
 
 
-def test_training_pictures_are_rendered_once_until_the_model_changes(tmp_path, monkeypatch):
-    pipeline = pipeline_of(write_scene(tmp_path))
+def test_training_pictures_are_rendered_once_until_the_model_changes(scene, monkeypatch):
+    pipeline = pipeline_of(scene)
     trained_step = pipeline.get_train_loss_dict
     state = deepcopy(pipeline.state_dict())
     original = pipeline.model.forward
@@ -252,8 +247,8 @@ def test_training_pictures_are_rendered_once_until_the_model_changes(tmp_path, m
     assert cost() == first
 
 
-def test_few_are_kept_where_pictures_are_large(tmp_path, monkeypatch):
-    pipeline = pipeline_of(write_scene(tmp_path))
+def test_few_are_kept_where_pictures_are_large(scene, monkeypatch):
+    pipeline = pipeline_of(scene)
     dataset = pipeline.datamanager.train_dataset
     assert TrainingDetail(pipeline.model, dataset).kept == plugin_detail.MOST_BYTES // (8 * 28 * 32)
     monkeypatch.setattr(plugin_detail, "MOST_BYTES", 1)
@@ -265,8 +260,8 @@ def test_few_are_kept_where_pictures_are_large(tmp_path, monkeypatch):
     assert held == plugin_detail.BYTES_A_PIXEL * 28 * 32
 
 
-def test_detail_is_without_the_pictures_exposure(tmp_path, monkeypatch):
-    pipeline = pipeline_of(write_scene(tmp_path))
+def test_detail_is_without_the_pictures_exposure(scene, monkeypatch):
+    pipeline = pipeline_of(scene)
     grey_ball(pipeline, monkeypatch)
     straight = errors(pipeline)[1]
     gains = pipeline.model.exposure.log_gains
@@ -281,8 +276,8 @@ def test_detail_is_without_the_pictures_exposure(tmp_path, monkeypatch):
     assert errors(pipeline)[1] == pytest.approx(straight, rel=0.01)
 
 
-def test_overexposed_pixels_do_not_darken_what_is_bright(tmp_path, monkeypatch):
-    pipeline = pipeline_of(write_scene(tmp_path))
+def test_overexposed_pixels_do_not_darken_what_is_bright(scene, monkeypatch):
+    pipeline = pipeline_of(scene)
     grey_ball(pipeline, monkeypatch)
     dataset, gains = pipeline.datamanager.train_dataset, pipeline.model.exposure.log_gains
     gains.data[0] = 1.5
@@ -326,13 +321,12 @@ def test_detail_is_seen_from_where_training_has_moved_the_cameras(tmp_path, monk
 
 
 @pytest.mark.parametrize("implementation", ["fused", "torch"])
-def test_with_an_embedding_a_picture_is_rendered_as_it_looks(tmp_path, implementation):
-    pipeline = pipeline_of(
-        write_scene(tmp_path), exposure="embedding", depth_loss="none", implementation=implementation
-    )
+def test_with_an_embedding_a_picture_is_rendered_as_it_looks(scene, implementation):
+    pipeline = pipeline_of(scene, exposure="embedding", depth_loss="none", implementation=implementation)
     model, camera = pipeline.model, pipeline.datamanager.train_dataset.cameras[:1]
+    weight = model.field.embedding_appearance.embedding.weight
     with torch.no_grad():
-        model.field.embedding_appearance.embedding.weight.normal_(0, 20.0)
+        weight.normal_(0, 20.0)
     with evaluated(model):
         usual = model.rendered_alone(camera)["rgb"]
         with with_appearance_of(model.field, 2):
@@ -341,9 +335,7 @@ def test_with_an_embedding_a_picture_is_rendered_as_it_looks(tmp_path, implement
             fourth = model.rendered_alone(camera)["rgb"]
         assert torch.equal(model.rendered_alone(camera)["rgb"], usual)
         # a mean of one picture is that picture's
-        model.field.embedding_appearance.embedding.weight[:] = model.field.embedding_appearance.embedding.weight[
-            2
-        ].clone()
+        weight[:] = weight[2].clone()
         torch.testing.assert_close(model.rendered_alone(camera)["rgb"], third)
     assert float((third - usual).abs().max()) > 0.01 and float((third - fourth).abs().max()) > 0.01
 

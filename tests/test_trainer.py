@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import re
 import shlex
@@ -15,7 +17,7 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.utils import writer
 from nerfstudio.viewer.viewer import Viewer
-from scenes import transforms, write_scene
+from scenes import fisheye, transforms, write_scene
 from trainings import trainer_of
 
 from edge_depth_nerf import cli
@@ -28,14 +30,35 @@ from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 from edge_depth_nerf.plugin.pipeline import EdgeDepthPipeline
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 
-STEPS = 6
+STEPS = 4
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("scene"), [fisheye(24, 20)])
+
+
+@pytest.fixture(autouse=True)
+def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "300")
 
 
 @pytest.fixture
-def trainer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> EdgeDepthTrainer:
-    monkeypatch.setenv("COLUMNS", "300")
-    write_scene(tmp_path / "scene")
-    return trainer_of(tmp_path / "scene", tmp_path / "runs", max_num_iterations=STEPS)
+def trainer(scene: Path, tmp_path: Path) -> EdgeDepthTrainer:
+    return trainer_of(scene, tmp_path / "runs", max_num_iterations=STEPS)
+
+
+@pytest.fixture(scope="module")
+def trained(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[EdgeDepthTrainer, str]:
+    """A training to its end, and what it said, of every step it can."""
+    said = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
+        patch.setenv("COLUMNS", "300")
+        patch.setattr("edge_depth_nerf.plugin.trainer.TOLD_EVERY_S", 0.0)
+        patch.setattr("edge_depth_nerf.plugin.trainer.TOLD_EVERY_SHARE", 0.0)
+        whole = trainer_of(scene, tmp_path_factory.mktemp("trained"), max_num_iterations=STEPS)
+        whole.train()
+    return whole, said.getvalue()
 
 
 def ctrl_c_within(trainer: EdgeDepthTrainer, at: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,31 +81,29 @@ def parameters(pipeline: Pipeline) -> dict[str, torch.Tensor]:
 
 def test_ctrl_c_finishes_the_step_saves_it_and_says_how_to_go_on(trainer, tmp_path, monkeypatch, capsys):
     before = signal.getsignal(signal.SIGINT)
-    ctrl_c_within(trainer, 3, monkeypatch)
+    ctrl_c_within(trainer, 2, monkeypatch)
     with pytest.raises(SystemExit) as ended:
         trainer.train()
     assert ended.value.code == 130
     assert signal.getsignal(signal.SIGINT) is before
-    newest = newest_checkpoint(trainer.checkpoint_dir)
-    assert newest is not None and newest.name == "step-000000003.ckpt"
+    assert os.listdir(trainer.checkpoint_dir) == ["step-000000002.ckpt"]
     said = capsys.readouterr().out
-    assert "Stopped after step 3; its checkpoint is saved." in said and "Traceback" not in said
-    assert f"--load-dir {trainer.checkpoint_dir} --max-num-iterations {STEPS - 4}" in said
-    again = trainer_of(trainer.config.data, tmp_path / "again", load_dir=newest.parent, max_num_iterations=STEPS - 4)
+    assert "Stopped after step 2; its checkpoint is saved." in said and "Traceback" not in said
+    folder, left = trainer.checkpoint_dir, STEPS - 3
+    assert f"--load-dir {folder} --max-num-iterations {left}" in said
+    again = trainer_of(trainer.config.data, tmp_path / "again", load_dir=folder, max_num_iterations=left)
     expected = parameters(trainer.pipeline)
     assert all(torch.equal(value, expected[name]) for name, value in parameters(again.pipeline).items())
     again.train()
-    last = newest_checkpoint(again.checkpoint_dir)
-    assert last is not None and last.name == f"step-{STEPS - 1:09}.ckpt"
+    assert os.listdir(again.checkpoint_dir) == [f"step-{STEPS - 1:09}.ckpt"]
 
 
-def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trainer, tmp_path):
+def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trained, tmp_path):
+    trainer = trained[0]
     whole = trainer.pipeline.model
     assert isinstance(whole, EdgeDepthNerfModel)
     assert whole.config.depth_loss_final == 0.01
-    trainer.train()
-    last = whole.depth_weight()
-    assert last == pytest.approx(whole.config.depth_loss_mult * 0.01 ** ((STEPS - 1) / STEPS))
+    assert whole.depth_weight() == pytest.approx(whole.config.depth_loss_mult * 0.01 ** ((STEPS - 1) / STEPS))
     folder = trainer.checkpoint_dir
     longer = trainer_of(trainer.config.data, tmp_path / "longer", load_dir=folder, max_num_iterations=STEPS)
     assert writer.GLOBAL_BUFFER["max_iter"] == 2 * STEPS  # what steps are shown against
@@ -133,9 +154,7 @@ def test_ctrl_c_while_a_checkpoint_is_written_leaves_it_whole(trainer, monkeypat
 
     monkeypatch.setattr(torch, "save", interrupted)
     trainer.train()  # the last checkpoint: training is complete
-    newest = newest_checkpoint(trainer.checkpoint_dir)
-    assert newest is not None and newest.name == f"step-{STEPS - 1:09}.ckpt"
-    assert os.listdir(trainer.checkpoint_dir) == [newest.name]
+    assert os.listdir(trainer.checkpoint_dir) == [f"step-{STEPS - 1:09}.ckpt"]
 
 
 def test_ctrl_c_ends_the_viewer_of_a_complete_training_without_error(trainer, monkeypatch, capsys):
@@ -150,8 +169,7 @@ def test_ctrl_c_ends_the_viewer_of_a_complete_training_without_error(trainer, mo
     assert "Stopped" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("switched_on", [False, True])
-def test_detail_appears_when_training_ends(trainer, monkeypatch, switched_on):
+def test_detail_appears_when_training_ends(trainer, monkeypatch):
     """The picture that the viewer shows is of before; nothing else asks for another one."""
     asked = []
     viewer = object.__new__(Viewer)
@@ -164,12 +182,14 @@ def test_detail_appears_when_training_ends(trainer, monkeypatch, switched_on):
     button = SimpleNamespace(visible=True)
     viewer_of_layers = SimpleNamespace(trainer=trainer, pause_train=button, resume_train=button)
     monkeypatch.setattr(layers, "viewer", viewer_of_layers, raising=False)
-    trainer.training_state = "training"
-    layers.detail.value = switched_on
-    assert not layers.shows_detail()
-    trainer._train_complete_viewer()
-    assert asked == ([True, "waits"] if switched_on else ["waits"])
-    assert not button.visible, "nothing can be paused any more"
+    for switched_on, expected in ((False, ["waits"]), (True, [True, "waits"])):
+        asked.clear()
+        trainer.training_state, button.visible = "training", True
+        layers.detail.value = switched_on
+        assert not layers.shows_detail()
+        trainer._train_complete_viewer()
+        assert asked == expected
+        assert not button.visible, "nothing can be paused any more"
 
 
 def test_a_relative_scene_is_said_to_be_relative(trainer, tmp_path, monkeypatch):
@@ -179,44 +199,37 @@ def test_a_relative_scene_is_said_to_be_relative(trainer, tmp_path, monkeypatch)
         trainer.config.save_config()
 
 
-@pytest.mark.parametrize(("method", "said"), [("edge-depth-nerf", True), ("edge-depth-nerf-lite", False)])
-def test_the_full_model_without_a_gpu_is_advised_against(trainer, capsys, method, said):
-    trainer.config.method_name = method
-    trainer.setup()
-    assert ("edge-depth-nerf-lite takes minutes" in " ".join(capsys.readouterr().out.split())) is said
+def test_the_full_model_without_a_gpu_is_advised_against(scene, tmp_path, capsys):
+    for method, said in (("edge-depth-nerf-lite", False), ("edge-depth-nerf", True)):
+        trainer_of(scene, tmp_path / method, method_name=method)
+        assert ("edge-depth-nerf-lite takes minutes" in " ".join(capsys.readouterr().out.split())) is said
 
 
-@pytest.mark.parametrize("mono", [True, False])
-def test_a_prior_of_lidar_alone_is_said(tmp_path, monkeypatch, capsys, mono):
-    monkeypatch.setenv("COLUMNS", "300")
-    trainer_of(write_scene(tmp_path / "scene", mono=mono), tmp_path / "runs", max_num_iterations=STEPS)
-    assert ("LiDAR alone" in capsys.readouterr().out) is not mono
-
-
-def test_a_drive_without_lidar_has_no_prior_of_it(tmp_path, monkeypatch, capsys):
-    """With distances from motion alone, these are the prior."""
-    monkeypatch.setenv("COLUMNS", "300")
-    scene = write_scene(tmp_path / "scene", lidar=False)
+def test_a_prior_of_lidar_alone_is_said(capsys, trainer, tmp_path):
+    """Not so of a drive without LiDAR, whose distances from motion are the prior."""
+    of_both = capsys.readouterr().out
+    trainer_of(write_scene(tmp_path / "no mono", mono=False, frames=3), tmp_path / "runs")
+    assert "LiDAR alone" in capsys.readouterr().out
+    scene = write_scene(tmp_path / "motion", lidar=False, frames=3)
     with transforms(scene) as meta:
         for frame in meta["frames"]:
             frame["motion_file_path"] = frame.pop("mono_file_path")
-    trainer_of(scene, tmp_path / "runs", max_num_iterations=STEPS)
-    said = capsys.readouterr().out
-    assert " Prior: " in said and "LiDAR alone" not in said
+    trainer_of(scene, tmp_path / "runs")
+    for said in (of_both, capsys.readouterr().out):
+        assert " Prior: " in said and "LiDAR alone" not in said
 
 
 @pytest.mark.parametrize("logged", [True, False])
-def test_logged_gradients_are_those_of_tables_too(tmp_path, logged):
+def test_logged_gradients_are_those_of_tables_too(scene, tmp_path, logged):
     """Without the log a table has none: its optimiser sums it up level by level."""
-    trainer = trainer_of(write_scene(tmp_path / "scene"), tmp_path / "runs", max_num_iterations=1, log_gradients=logged)
+    trainer = trainer_of(scene, tmp_path / "runs", max_num_iterations=1, log_gradients=logged)
     trainer.train_iteration(0)
     tables = {name: each for name, each in trainer.pipeline.model.named_parameters() if "hash_table" in name}
     assert tables and {each.grad is not None for each in tables.values()} == {logged}
 
 
-def test_checkpoints_may_go_to_another_place(tmp_path):
+def test_checkpoints_may_go_to_another_place(scene, tmp_path):
     folder = tmp_path / "elsewhere" / "checkpoints"
-    scene = write_scene(tmp_path / "scene")
     trainer = trainer_of(scene, tmp_path / "runs", max_num_iterations=1, relative_model_dir=folder)
     trainer.save_checkpoint(0)
     assert [path.name for path in folder.parent.iterdir()] == ["checkpoints"]
@@ -232,36 +245,26 @@ def test_ctrl_c_before_the_first_step(trainer, monkeypatch, capsys, work, within
     assert ended.value.code == 130 and "Stopped before the first step." in capsys.readouterr().out
 
 
-def test_a_checkpoint_of_the_full_preset_on_a_cpu_is_taken_up_on_a_gpu_and_back(trainer, tmp_path, monkeypatch):
+def test_a_checkpoint_of_the_full_preset_on_a_cpu_is_taken_up_on_a_gpu_and_back(trained, trainer, monkeypatch):
     """What mixed precision keeps is nothing on a CPU; a scaler of a GPU begins anew, and its state harms no CPU."""
-    trainer.train()
     monkeypatch.setattr("torch.cuda.amp.common.amp_definitely_not_available", lambda: False)
-    scalers = []
-
-    def loaded(scaler: PatientGradScaler, number: int) -> None:
-        """Take the checkpoint up as a trainer with this scaler does, and save it again."""
-        newest = newest_checkpoint(trainer.checkpoint_dir)
+    scalers, folder = [], trained[0].checkpoint_dir
+    for enabled in (True, False):
+        newest = newest_checkpoint(folder)
         assert newest is not None
         scalers.append(torch.load(newest)["scalers"])
-        again = trainer_of(trainer.config.data, tmp_path / str(number))
-        again.grad_scaler = scaler
-        again.config.load_dir = newest.parent
-        again._load_checkpoint()
-        again.checkpoint_dir = trainer.checkpoint_dir
-        again.save_checkpoint(STEPS + number)
-
-    loaded(PatientGradScaler(enabled=True), 1)
-    loaded(PatientGradScaler(enabled=False), 2)
+        # as a trainer with this scaler takes it up, and saves it again
+        trainer.grad_scaler, trainer.config.load_dir = PatientGradScaler(enabled=enabled), folder
+        trainer._load_checkpoint()
+        folder = trainer.checkpoint_dir
+        trainer.save_checkpoint(STEPS + len(scalers))
     assert scalers[0] == {} and scalers[1]["scale"] == 2.0**16
 
 
-def test_a_training_says_where_it_is_and_ends_with_the_next_commands(trainer, monkeypatch, capsys):
-    monkeypatch.setattr("edge_depth_nerf.plugin.trainer.TOLD_EVERY_S", 0.0)
-    monkeypatch.setattr("edge_depth_nerf.plugin.trainer.TOLD_EVERY_SHARE", 0.0)
-    trainer.train()
-    said = capsys.readouterr().out
-    lines = re.findall(r"^Step (\d) of 6: loss (\d\.\d+), held-out PSNR (\d+\.\d) dB; .* rays/s(.*)$", said, re.M)
-    assert [line[0] for line in lines] == ["2", "3", "4", "5", "6"]
+def test_a_training_says_where_it_is_and_ends_with_the_next_commands(trained):
+    trainer, said = trained
+    lines = re.findall(r"^Step (\d) of 4: loss (\d\.\d+), held-out PSNR (\d+\.\d) dB; .* rays/s(.*)$", said, re.M)
+    assert [line[0] for line in lines] == ["2", "3", "4"]
     assert all(line[3].endswith("to go") for line in lines[:-1]) and lines[-1][3] == ""
     assert float(lines[-1][2]) == pytest.approx(trainer.pipeline.held_out_psnr(), abs=3)
     config = trainer.base_dir / "config.yml"
