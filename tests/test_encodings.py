@@ -1,4 +1,4 @@
-"""The fused hash grid against nerfstudio's class and against a NumPy form of its own."""
+"""The fused hash grid and its formula against nerfstudio's class."""
 
 import multiprocessing
 import sys
@@ -21,11 +21,10 @@ from edge_depth_nerf.plugin.fused.hash_grid import FusedHashEncoding
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 
 SIZES = {
-    "nerfacto": {"num_levels": 16, "log2_hashmap_size": 19, "max_res": 2048},
+    "many levels": {"num_levels": 16, "log2_hashmap_size": 15, "max_res": 2048},
     "proposal 1": {"num_levels": 5, "log2_hashmap_size": 17, "max_res": 128},
-    "proposal 2": {"num_levels": 5, "log2_hashmap_size": 17, "max_res": 256},
     "lite": {"num_levels": 8, "log2_hashmap_size": 16, "max_res": 512},
-    "big": {"num_levels": 16, "log2_hashmap_size": 21, "max_res": 8192},
+    "big": {"num_levels": 2, "log2_hashmap_size": 21, "max_res": 8192},
     "one level": {"num_levels": 1, "log2_hashmap_size": 10},
     "four features": {"num_levels": 3, "log2_hashmap_size": 12, "features_per_level": 4, "max_res": 100},
     "one feature": {"num_levels": 3, "log2_hashmap_size": 12, "features_per_level": 1, "max_res": 100},
@@ -65,51 +64,6 @@ def points(scalings: torch.Tensor, count: int = 1000) -> torch.Tensor:
     return torch.cat([random, corners, borders, mixed])
 
 
-def numpy_form(x: np.ndarray, table: np.ndarray, scalings: np.ndarray, gradient: np.ndarray):
-    """Instant-NGP's multiresolution hash with nerfstudio's choices, in float64 but for the scaled position.
-
-    Returns the encoded points and the gradients to table and positions.
-    """
-    levels, features = len(scalings), table.shape[1]
-    rows = len(table) // levels
-    encoded = np.zeros((len(x), levels * features))
-    to_table, to_x = np.zeros(table.shape), np.zeros(x.shape)
-    for level, scaling in enumerate(scalings):
-        scaled = x * scaling  # in float32, as it decides in which cell a point lies
-        bounds = [np.floor(scaled).astype(np.int64), np.ceil(scaled).astype(np.int64)]
-        place = scaled.astype(np.float64) - bounds[0]
-        columns = slice(level * features, (level + 1) * features)
-        for upper in np.ndindex(2, 2, 2):
-            corner = [bounds[side][:, axis] for axis, side in enumerate(upper)]
-            row = (corner[0] ^ (corner[1] * 2654435761) ^ (corner[2] * 805459861)) % rows + level * rows
-            along = [place[:, axis] if side else 1 - place[:, axis] for axis, side in enumerate(upper)]
-            encoded[:, columns] += (along[0] * along[1] * along[2])[:, None] * table[row]
-            np.add.at(to_table, row, (along[0] * along[1] * along[2])[:, None] * gradient[:, columns])
-            value = (gradient[:, columns].astype(np.float64) * table[row]).sum(1) * float(scaling)
-            for axis in range(3):
-                others = np.prod([along[other] for other in range(3) if other != axis], axis=0)
-                to_x[:, axis] += (1 if upper[axis] else -1) * others * value
-    return encoded, to_table, to_x
-
-
-@pytest.mark.parametrize("name", ["lite", "proposal 1", "one level", "four features"])
-def test_equals_the_formula(name):
-    _, fused = both(**SIZES[name])
-    x = points(fused.scalings).requires_grad_()
-    encoded = fused(x)
-    gradient = torch.randn(encoded.shape)
-    encoded.backward(gradient)
-    given = x.detach().numpy(), fused.hash_table.detach().numpy(), fused.scalings.float().numpy(), gradient.numpy()
-    expected = [torch.from_numpy(each) for each in numpy_form(*given)]
-    assert_near(encoded.detach(), expected[0], 1e-6)
-    assert_near(fused.hash_table.grad, expected[1], 1e-5)
-    assert_near(x.grad, expected[2], 1e-5)
-    with torch.no_grad():
-        exact = formulas.hash_grid(x.double(), fused.hash_table.double(), fused.scalings.double())
-    # a place in a cell has lost digits where it was of float32
-    assert_near(exact, expected[0], 2e-7 * float(fused.scalings.max()))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SIZES)
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=NEEDS_A_GPU)])
@@ -125,6 +79,10 @@ def test_equals_nerfstudio(name, device):
         each.backward(gradient)
     assert_near(fused.hash_table.grad, host.hash_table.grad, 1e-5)
     assert_near(xs[1].grad, xs[0].grad, 1e-5)
+    with torch.no_grad():
+        exact = formulas.hash_grid(x.double(), fused.hash_table.double(), fused.scalings.double())
+    # a place in a cell has lost digits where it was of float32
+    assert_near(encoded[0].detach(), exact, 2e-7 * float(fused.scalings.max()))
 
 
 def test_many_additions_to_one_row():
@@ -139,34 +97,8 @@ def test_many_additions_to_one_row():
     assert int((fused.hash_table.grad != 0).sum()) == 10
 
 
-def test_a_border_has_no_gradient_across_it():
-    _, fused = both(num_levels=1, log2_hashmap_size=10)
-    x = torch.tensor([[0.5, 0.26, 0.77], [0.26, 0.77, 0.5]], requires_grad=True)  # 16 cells: 0.5 is a border
-    fused(x).sum().backward()
-    assert x.grad is not None
-    assert torch.equal(x.grad == 0, torch.tensor([[True, False, False], [False, False, True]]))
-
-
-def test_gradient_to_positions_is_the_slope():
-    _, fused = both(num_levels=3, log2_hashmap_size=12, max_res=40)
-    step = 1e-3
-    # the middle of cells of the finest level, and not near borders of the others
-    x = (torch.randint(0, 40, (400, 3)) + 0.5) / 40
-    scaled = x[:, None] * fused.scalings[:, None]
-    x = x[((scaled - scaled.round()).abs() > 2 * step * 40).all(-1).all(-1)].requires_grad_()
-    assert len(x) > 20
-    weights = torch.randn(6)
-    (fused(x) @ weights).sum().backward()
-    assert x.grad is not None
-    with torch.no_grad():
-        for axis in range(3):
-            move = step * torch.eye(3)[axis]
-            slope = ((fused(x + move) - fused(x - move)) @ weights) / (2 * step)
-            assert_near(x.grad[:, axis], slope, 1e-3)
-
-
-@pytest.mark.parametrize("count", [1, 255, 256, 257, 5000])
-@pytest.mark.parametrize("levels", [1, 5, 8])
+@pytest.mark.parametrize("count", [1, 256, 257, 5000])
+@pytest.mark.parametrize("levels", [1, 5])
 def test_threads_do_not_change_the_result(small_shares, levels, count):
     _, fused = both(num_levels=levels, log2_hashmap_size=8, max_res=64)
     x, gradient = torch.rand(count, 3), torch.randn(count, 2 * levels)
@@ -228,7 +160,7 @@ def test_a_forked_process_starts_its_own_threads(small_shares):
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64], ids=str)
-def test_other_types_of_positions(dtype):
+def test_other_types_of_positions_and_of_the_table(dtype):
     host, fused = both(**SIZES["four features"])
     x = torch.rand(50, 3).to(dtype)
     xs = [x.clone().requires_grad_() for _ in range(2)]
@@ -238,13 +170,9 @@ def test_other_types_of_positions(dtype):
         each.square().sum().backward()
     torch.testing.assert_close(xs[0].grad, xs[1].grad)
     assert_near(fused.hash_table.grad, host.hash_table.grad, 1e-5)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float64], ids=str)
-def test_other_types_of_the_table(dtype):
-    host, fused = (encoding.to(dtype) for encoding in both(**SIZES["four features"]))
-    x = torch.rand(50, 3)
-    assert torch.equal(host(x), fused(x)) and host(x).dtype == fused(x).dtype
+    if dtype != torch.bfloat16:
+        of_table = [encoding.to(dtype)(x.float()) for encoding in (host, fused)]
+        assert torch.equal(*of_table) and of_table[0].dtype == of_table[1].dtype
 
 
 def test_under_mixed_precision():
@@ -286,24 +214,19 @@ def test_strided_tensors():
 
 @pytest.mark.parametrize(("of_positions", "of_table"), [(True, False), (False, True), (False, False)])
 def test_only_the_gradients_asked_for(of_positions, of_table, monkeypatch):
-    host, fused = both(**SIZES["four features"])
+    _, fused = both(**SIZES["four features"])
     for name, wanted in (("position_gradient", of_positions), ("table_gradient", of_table)):
         if not wanted:
             monkeypatch.setattr(cpu, name, lambda *_: pytest.fail("not asked for"))
-    x = torch.rand(20, 3)
-    xs = [x.clone().requires_grad_(of_positions) for _ in range(2)]
-    for encoding, each in zip((host, fused), xs, strict=True):
-        encoding.hash_table.requires_grad_(of_table)
-        encoded = encoding(each)
-        assert encoded.requires_grad == (of_positions or of_table)
-        if encoded.requires_grad:
-            encoded.square().sum().backward()
-    if of_positions:
-        assert_near(xs[1].grad, xs[0].grad, 1e-5)
-    if of_table:
-        assert_near(fused.hash_table.grad, host.hash_table.grad, 1e-5)
+    x = torch.rand(20, 3).requires_grad_(of_positions)
+    fused.hash_table.requires_grad_(of_table)
+    encoded = fused(x)
+    assert encoded.requires_grad == (of_positions or of_table)
+    if encoded.requires_grad:
+        encoded.sum().backward()
+    assert (x.grad is not None, fused.hash_table.grad is not None) == (of_positions, of_table)
     with torch.no_grad():
-        assert not fused(xs[1]).requires_grad
+        assert not fused(x).requires_grad
 
 
 def test_a_second_derivative_is_refused():
@@ -345,10 +268,8 @@ def encodings_of(model: torch.nn.Module) -> list[HashEncoding]:
 @pytest.mark.parametrize(
     "options",
     [
-        {"max_res": 512},
         {"max_res": 512, "predict_normals": True},
         {"max_res": 512, "poses": "SO3xR3"},
-        {"max_res": 512, "num_levels": 16},
         {"max_res": 2048},
     ],
     ids=str,
@@ -392,9 +313,7 @@ def test_gradients_by_positions_alone_leave_the_tables_be():
 def test_the_contraction_is_nerfactos():
     """Inside and outside the unit cube, on its border, and where two or three axes are equally far."""
     at = torch.tensor([-30.0, -2.0, -1.0, -0.5, 0.0, 1e-30, 0.3, 1.0, 2.0, 1e6])
-    x = torch.cat(
-        [torch.cartesian_prod(at, at, at), 3 * torch.randn(500, 3, generator=torch.Generator().manual_seed(0))]
-    )
+    x = torch.cat([torch.cartesian_prod(at, at, at), 3 * torch.randn(500, 3)])
     assert isinstance(build().field.spatial_distortion, CubeContraction)
     found = []
     for kind in (SceneContraction, CubeContraction):

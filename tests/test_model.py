@@ -32,13 +32,17 @@ def batch() -> dict:
     return supervision(16, 2)
 
 
+def losses_of(model, outputs, supervision):
+    return model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+
+
 def trained_step(model, further=None):
     """Outputs and losses of one training step; the same samples for every model of the same seed."""
     supervision = batch() | (further or {})
     model.train()
     torch.manual_seed(3)
     outputs = model(rays(), supervision)
-    return outputs, model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+    return outputs, losses_of(model, outputs, supervision)
 
 
 def are_taught(parameters) -> bool:
@@ -83,15 +87,10 @@ def test_the_edge_loss_is_eq_4_in_metres():
     assert torch.allclose(losses["edge_loss"], 0.25 * per_ray.sum() / 12)
     assert losses["edge_loss"] > 0
     losses["edge_loss"].backward()
-    assert are_taught(model.field.mlp_base.parameters())
-
-
-def test_all_levels_reach_the_proposal_networks():
-    for levels, reached in (("all", True), ("final", False)):
-        model = build(depth_loss_levels=levels)
-        _, losses = trained_step(model)
-        losses["edge_loss"].backward()
-        assert are_taught(model.proposal_networks.parameters()) == reached
+    assert are_taught(model.field.mlp_base.parameters()) and not are_taught(model.proposal_networks.parameters())
+    all_levels = build(depth_loss_levels="all")
+    trained_step(all_levels)[1]["edge_loss"].backward()
+    assert are_taught(all_levels.proposal_networks.parameters())
 
 
 @pytest.mark.parametrize("kind", ["ds-nerf", "urban-nerf"])
@@ -128,16 +127,6 @@ def test_urban_nerf_of_its_authors_is_in_metres_and_narrows():
         assert torch.allclose(losses["urban_nerf_los_loss"], 0.5 * total / 3)
     losses["urban_nerf_los_loss"].backward()
     assert are_taught(model.field.mlp_base.parameters())
-
-
-def test_sigma_of_ds_nerf_is_a_standard_deviation_in_metres():
-    """One sample a ray, one sigma from the prior: it is pulled exp(-1/2) as hard as one at the prior."""
-    pulls = []
-    for midpoint_m in (5.0, 5.3):
-        starts_m, ends_m = (torch.full((1, 1), midpoint_m + half) for half in (-0.05, 0.05))
-        level = Level(torch.full((1, 1), 0.5), starts_m, ends_m, torch.tensor([5.0]), torch.tensor([9.0]))
-        pulls.append(float(DsNerfLoss(sigma_m=0.3)(level)))
-    assert pulls[1] / pulls[0] == pytest.approx(math.exp(-0.5), rel=1e-4)
 
 
 def test_without_a_depth_loss_it_is_nerfacto():
@@ -217,7 +206,7 @@ def test_what_lidar_measured_keeps_its_weight(sharp, scheduled):
     if scheduled:
         # as in a recorded step, which reads λ from the device
         model.scheduled_weight = torch.tensor(0.005)
-        losses = model.get_loss_dict(outputs, supervision, model.get_metrics_dict(outputs, supervision))
+        losses = losses_of(model, outputs, supervision)
     levels = [replace(each, sigma_m=supervision["prior_sigma_m"][:, 0]) for each in levels_of(outputs)]
     expected = sum((weights * EdgeLoss()(each)).sum() for each in levels) / 12 / 3
     assert float(losses["edge_loss"]) == pytest.approx(float(expected), rel=1e-5)
@@ -225,7 +214,7 @@ def test_what_lidar_measured_keeps_its_weight(sharp, scheduled):
 
 def test_what_nothing_stops_has_the_colour_of_the_direction():
     """Empty space shows the field at infinity: the same from wherever the camera stands."""
-    model, plain = build().eval(), build(sky_background=False).eval()
+    model, plain = build(small=False).eval(), build(small=False, sky_background=False).eval()
     with torch.no_grad():
         # a new field has one colour everywhere
         for of_model, of_plain in zip(model.field.parameters(), plain.field.parameters(), strict=True):
@@ -300,7 +289,7 @@ def test_surface_pixels_that_do_not_count_change_no_loss():
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-6)
     nowhere = surface() | {"surface_counts": torch.zeros(6, 1, dtype=torch.bool)}
     loss = trained_step(model, nowhere)[1]["surface_loss"]
-    assert loss == 0 and loss.requires_grad
+    assert float(loss.detach()) == 0 and loss.requires_grad
 
 
 def test_losses_of_final_samples_alone():
@@ -350,7 +339,7 @@ def test_a_surface_that_is_not_between_the_planes_says_nothing(distance_m):
 
 
 @pytest.mark.parametrize("kind", LOSSES)
-@pytest.mark.parametrize("distance_m", [0.05, 0.199, 51.0, 255.9])
+@pytest.mark.parametrize("distance_m", [0.199, 51.0])
 def test_a_prior_that_is_not_between_the_planes_is_none(kind, distance_m):
     model, name = build(depth_loss=kind, near_m=0.2, far_m=50.0), LOSSES[kind]
     outputs, _ = trained_step(model)
@@ -379,14 +368,6 @@ def test_distance_is_that_of_what_a_ray_hits():
     weights = torch.tensor([[0.0, 0.3, 0.0, 0.0], [0.0, 0.0, 0.8, 0.2], [0.01, 0.0, 0.0, 0.0]])[..., None]
     renderer = DepthInEvaluation(method="median").eval()
     assert renderer(weights, samples)[:, 0].tolist() == [1.5, 2.5, 3.5]
-
-
-def test_no_download_and_no_lpips_in_the_checkpoint(monkeypatch, tmp_path):
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", lambda *_, **__: pytest.fail("downloads"))
-    model = build()
-    assert not [name for name in model.state_dict() if "lpips" in name]
-    assert math.isnan(model.lpips(torch.zeros(1, 3, 8, 8), torch.zeros(1, 3, 8, 8)))
 
 
 def evaluated_view(height=24, width=20):

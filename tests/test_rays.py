@@ -66,10 +66,9 @@ def test_they_are_kept_and_nobody_writes_into_them():
     found = rays(EQUIDISTANT, 1.0)
     assert rays(KannalaBrandt(64, 48, 15.0, 15.0, 32.5, 24.5, 0.0, 0.0, 0.0, 0.0), 1.0) is found
     assert rays(EQUIDISTANT, 1.1) is not found
-    with pytest.raises(ValueError, match="read-only"):
-        found.directions[0, 0] = 1
-    with pytest.raises(ValueError, match="read-only"):
-        found.within[0, 0] = True
+    for array in (found.directions, found.within):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0, 0] = 1
     for number in range(KEPT):
         rays(PINHOLE.downscaled(2 + number % 4), 0.5 + number / 100)
     assert rays.cache_info().currsize == KEPT
