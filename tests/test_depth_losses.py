@@ -99,6 +99,14 @@ def test_every_loss_gives_a_number_a_ray_and_none_without_a_prior(kind):
     assert given.weights.grad is not None and not given.weights.grad[1].any() and given.weights.grad[0].any()
 
 
+def test_urban_nerfs_sigma_narrows_over_the_training():
+    loss = UrbanNerfSightLoss(sigma_m=0.1, narrowing=16.0)
+    constant = replace(loss, narrowing=1.0)
+    for share, sigma_m in ((0.0, 1.6), (0.5, 0.4), (1.0, 0.1)):
+        narrowed, expected = loss(level([3.0], share_done=share)), replace(constant, sigma_m=sigma_m)(level([3.0]))
+        torch.testing.assert_close(narrowed, expected)
+
+
 def test_a_configuration_names_its_loss(monkeypatch):
     """A config.yml may name one that was registered after it was written, or that is not registered here."""
     config = copy(all_methods["edge-depth-nerf-lite"].pipeline.model)

@@ -142,6 +142,25 @@ def test_an_edge_counts_at_its_place_in_its_direction():
     assert share(stripe(20, 1.0), target) == 1 and share(stripe(20, 16.0), target) == 0
 
 
+def test_a_depth_edge_counts_at_its_place_in_its_direction():
+    def street(place: int, near: float = 5.0, far: float = 20.0) -> torch.Tensor:
+        found = torch.full((H, W), near)
+        found[:, place:] = far
+        return found
+
+    everywhere, target = torch.ones(H, W, dtype=torch.bool), street(20)
+    assert depth_edges_found(target, target, everywhere) == (H, H)
+    for place in (18, 22):
+        assert depth_edges_found(street(place), target, everywhere) == (H, H)
+    for place in (17, 23):
+        assert depth_edges_found(street(place), target, everywhere)[0] == 0
+    assert depth_edges_found(street(20, 20, 5), target, everywhere)[0] == 0
+    assert depth_edges_found(street(20, 10, 19), target, everywhere)[0] == 0
+    # a road that recedes down its rows has no edges
+    road = torch.linspace(2, 59, H)[:, None].expand(H, W).contiguous()
+    assert depth_edges_found(road, road, everywhere) == (0, 0)
+
+
 def test_shares_are_of_all_views_together():
     recall = EdgeRecall()
     for name, found in (("edges", (1, 2)), ("edges", (3, 8)), ("none", (0, 0))):

@@ -36,11 +36,26 @@ def test_new_gains_change_nothing_and_one_picture_keeps_it_so(colours):
     torch.testing.assert_close(seen_by(some_gains(1), 0, colours), colours)
 
 
-def test_a_training_with_an_exposure_of_an_earlier_version_is_refused(tmp_path):
+def test_gains_learn_a_cameras_gain(colours):
+    """Two pictures of the same scene, one a third brighter than the other: the gains take up the difference."""
+    found = Gains(2)
+    optimizer = torch.optim.Adam(found.parameters(), 0.02)
+    picture = torch.arange(200) % 2
+    target = colours * torch.tensor([0.85, 1.15])[picture][:, None]
+    for _ in range(200):
+        optimizer.zero_grad()
+        loss = (found(colours, picture) - target).square().mean()
+        loss.backward()
+        optimizer.step()
+    assert float(loss.detach()) < 3e-4 < float((colours - target).square().mean())
+
+
+@pytest.mark.parametrize("exposure", ["affine", "grid"])
+def test_a_training_with_an_exposure_of_an_earlier_version_is_refused(tmp_path, exposure):
     from models import pipeline_config  # imports nerfstudio
 
     text = yaml.dump(pipeline_config(write_scene(tmp_path, frames=2)))
     assert "exposure: gain" in text
-    config = yaml.load(text.replace("exposure: gain", "exposure: affine"), yaml.Loader)  # as ns-eval does
-    with pytest.raises(InputError, match=r"exposure affine: .*one of gain, embedding, none\. Train again"):
+    config = yaml.load(text.replace("exposure: gain", f"exposure: {exposure}"), yaml.Loader)  # as ns-eval does
+    with pytest.raises(InputError, match=rf"exposure {exposure}: .*one of gain, embedding, none\. Train again"):
         config.setup(device="cpu", test_mode="test")

@@ -2,12 +2,16 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.method import integration, integration_numba
@@ -60,8 +64,9 @@ def by_torch(
     maps = [each.reshape(shape[:-2].numel(), *shape[-2:]) for each in (lidar, mono, valid)]
     out = torch.empty(3, *maps[0].shape, dtype=dtype)
     for i, (lidar_map, mono_map, valid_map) in enumerate(zip(*maps, strict=True)):
-        given = lidar_map.to(dtype), mono_map.to(dtype), valid_map
-        integrate_by_torch(*given, options or IntegrationOptions(), out[:, i])
+        integrate_by_torch(
+            lidar_map.to(dtype), mono_map.to(dtype), valid_map, options or IntegrationOptions(), out[:, i]
+        )
     return IntegratedDepth(*out.reshape(3, *shape))
 
 
@@ -75,16 +80,20 @@ def assert_equal(found: IntegratedDepth, exact: IntegratedDepth, atol: float) ->
     torch.testing.assert_close(found.mono_share.double(), exact.mono_share, rtol=0, atol=atol / 10)
 
 
-CHOICES = itertools.product(["edge-aware", "spatial-gaussian"], ["pooled", "residual"], [False, True], [0.7, 0.0, 1.0])
+CHOICES = list(
+    itertools.product(["edge-aware", "spatial-gaussian"], ["pooled", "residual"], [False, True], [0.7, 0.0, 1.0])
+)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize(("kind", "normalise", "keep_returns", "alpha"), CHOICES)
 def test_both_forms_are_equal(kind, normalise, keep_returns, alpha, dtype):
     options = IntegrationOptions(alpha=alpha, kernel=kind, normalise=normalise, keep_returns=keep_returns)
-    lidar, mono, valid = random_maps(2, dtype=dtype)
-    result = integrate_depth(lidar, mono, valid, options)
-    exact = by_torch(lidar.double(), mono.double(), valid, options)
+    lidar, mono, valid = random_maps(CHOICES.index((kind, normalise, keep_returns, alpha)), dtype=dtype)
+    result, exact = (
+        integrate_depth(lidar, mono, valid, options),
+        by_torch(lidar.double(), mono.double(), valid, options),
+    )
     assert result.distance_m.dtype == dtype
     assert_equal(result, exact, 1e-4 if dtype == torch.float32 else 1e-9)
     assert 0 < (exact.distance_m > 0).double().mean() < 1
@@ -111,8 +120,9 @@ def test_both_forms_are_equal(kind, normalise, keep_returns, alpha, dtype):
 def test_both_forms_are_equal_with_other_kernels(fields):
     lidar, mono, valid = random_maps(5)
     options = IntegrationOptions(**fields)
-    exact = by_torch(lidar.double(), mono.double(), valid, options)
-    assert_equal(integrate_depth(lidar, mono, valid, options), exact, 1e-4)
+    assert_equal(
+        integrate_depth(lidar, mono, valid, options), by_torch(lidar.double(), mono.double(), valid, options), 1e-4
+    )
 
 
 @BOTH
@@ -149,6 +159,101 @@ def test_one_point_by_hand(integrate):
     distance = 10 * np.exp(0.972980 * mean)
     assert float(result.distance_m[1, 1]) == pytest.approx(distance, abs=2e-5)
     assert float(result.spread_m[1, 1]) == pytest.approx(distance * np.sqrt(0.972980 * variance), abs=2e-4)
+
+
+@BOTH
+def test_a_lone_point_makes_no_square(integrate):
+    # one return of 12 among 10: with its whole weight all of its 9×9 window is 12 and what lies beyond is 10;
+    # with least_returns it corrects by its weight, exp(-(k² + l²)/18), over 4
+    mono = torch.full((15, 15), 10.0)
+    lidar = torch.zeros(15, 15)
+    lidar[7, 7] = 12.0
+    square = integrate(
+        lidar, mono, everywhere(mono), IntegrationOptions(normalise="residual", least_returns=0.1)
+    ).distance_m
+    assert float(square[7, 8]) == pytest.approx(12.0, abs=1e-5) == float(square[3, 3])
+    assert float(square[7, 12]) == 10
+    options = IntegrationOptions(normalise="residual", least_returns=4.0)
+    soft = integrate(lidar, mono, everywhere(mono), options).distance_m
+    for down, right in ((0, 1), (2, 3), (4, 4)):
+        expected = 10 * 1.2 ** (np.exp(-(down**2 + right**2) / 18) / 4)
+        assert float(soft[7 + down, 7 + right]) == pytest.approx(expected, abs=1e-5)
+    # where returns are dense nothing changes
+    dense = torch.full((15, 15), 12.0)
+    dense[:, ::3] = 0
+    known, unchanged = (
+        integrate(dense, mono, everywhere(mono), one)
+        for one in (options, IntegrationOptions(normalise="residual", least_returns=0.1))
+    )
+    assert_same(known, unchanged, 1e-6)
+
+
+@BOTH
+def test_lidar_on_a_slope_corrects_the_slope(integrate):
+    # road: distances grow along the rows; LiDAR says 4 % more, in every fourth row. Its values, averaged in a window
+    # (pooled), say what is at other rows; its differences say 4 % everywhere
+    mono = (8 * 1.06 ** torch.arange(20.0, dtype=torch.float64))[:, None].expand(20, 9).contiguous()
+    lidar = torch.zeros_like(mono)
+    lidar[2::4] = 1.04 * mono[2::4]
+    options = IntegrationOptions(sigma_depth_m=100.0, sigma_space_px=1.0, normalise="residual", least_returns=0.1)
+    none = integrate(torch.zeros_like(mono), mono, everywhere(mono), options).distance_m
+    found = integrate(lidar, mono, everywhere(mono), options).distance_m
+    inner = slice(8, 12)
+    # the window's average of the map itself is a little more than its middle, and is what LiDAR is compared with
+    above = none[10, 4] / mono[10, 4]
+    torch.testing.assert_close(found[inner], 1.04 / above * none[inner], rtol=1e-6, atol=0)
+    pooled = integrate(lidar, mono, everywhere(mono), IntegrationOptions(sigma_depth_m=100.0, sigma_space_px=1.0))
+    off = (pooled.distance_m[inner] / (1.04 * mono[inner]) - 1).abs().mean()
+    assert (found[inner] / (1.04 * mono[inner]) - 1).abs().max() < 1e-6 < 0.01 < off
+
+
+@pytest.mark.parametrize("kind", ["edge-aware", "spatial-gaussian"])
+@pytest.mark.parametrize("normalise", ["pooled", "residual"])
+@BOTH
+def test_constant_map_stays(integrate, kind, normalise):
+    mono = torch.full((12, 15), 73.3)
+    lidar = torch.where(torch.rand(12, 15, generator=torch.Generator().manual_seed(0)) < 0.2, 73.3, 0.0)
+    valid = random_maps(1, 12, 15)[2]
+    result = integrate(lidar, mono, valid, IntegrationOptions(kernel=kind, normalise=normalise))
+    assert torch.equal(result.distance_m > 0, valid)
+    torch.testing.assert_close(result.distance_m[valid], mono[valid], rtol=0, atol=1e-5)
+    assert float(result.spread_m.max()) < 1e-5
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 1000), scale=st.floats(0.05, 20))
+@pytest.mark.parametrize("normalise", ["pooled", "residual"])
+def test_scaling_distances_scales_the_prior(normalise, seed, scale):
+    lidar, mono, valid = random_maps(seed, dtype=torch.float64)
+    options = IntegrationOptions(sigma_depth_m=1.3, normalise=normalise)
+    before = integrate_depth(lidar, mono, valid, options)
+    after = integrate_depth(lidar * scale, mono * scale, valid, dataclasses.replace(options, sigma_depth_m=1.3 * scale))
+    assert_same(
+        after, IntegratedDepth(before.distance_m * scale, before.spread_m * scale, before.mono_share), atol=1e-6
+    )
+
+
+@BOTH
+def test_adding_a_distance_adds_it_to_the_prior(integrate):
+    lidar, mono, valid = random_maps(3, dtype=torch.float64)
+    before = integrate(lidar, mono, valid)
+    usable = torch.isfinite(mono) & (mono > 0)
+    lidar_points = torch.isfinite(lidar) & (lidar > 0)
+    after = integrate(torch.where(lidar_points, lidar + 7, 0), torch.where(usable, mono + 7, 0), valid)
+    exists = (before.distance_m > 0).double()
+    assert_same(after, IntegratedDepth(before.distance_m + 7 * exists, before.spread_m, before.mono_share))
+
+
+@BOTH
+def test_moves_and_flips_with_the_picture(integrate):
+    lidar, mono, valid = random_maps(4)
+    expected = integrate(lidar, mono, valid)
+
+    def changed(change) -> IntegratedDepth:
+        return IntegratedDepth(*(change(getattr(expected, f.name)) for f in dataclasses.fields(expected)))
+
+    for change in (lambda t: torch.nn.functional.pad(t, (3, 6, 5, 2)), lambda t: t.flip(0).contiguous(), lambda t: t.T):
+        assert_same(integrate(change(lidar), change(mono), change(valid)), changed(change))
 
 
 @BOTH
@@ -255,6 +360,12 @@ def test_batch_and_strips_change_nothing(monkeypatch):
         assert_same(alone, IntegratedDepth(*of_batch), atol=1e-6)
 
 
+def test_leaves_the_number_of_threads_alone():
+    before = torch.get_num_threads()
+    integrate_depth(*random_maps(0))
+    assert torch.get_num_threads() == before
+
+
 @pytest.fixture
 def two_threads():
     before = torch.get_num_threads()
@@ -274,7 +385,6 @@ def test_threads_and_concurrent_callers_change_no_bit(normalise, two_threads, mo
         results = list(pool.map(lambda m: integrate_depth(m[0], m[1], m[2], options), maps * 8))
     for result, expected in zip(results, in_one_piece * 8, strict=True):
         assert_same(result, expected, atol=0)
-    assert torch.get_num_threads() == 2
 
 
 @pytest.mark.parametrize("normalise", ["pooled", "residual"])
@@ -306,6 +416,20 @@ def test_compiles_where_nothing_can_be_kept():
     with pytest.raises(RuntimeError, match="cannot cache"):
         numba.njit(cache=True)(names["double"])
     assert integration_numba._compiled(names["double"])(21) == 42
+
+
+@pytest.mark.slow
+def test_numba_is_loaded_only_to_integrate():
+    check = "import sys, edge_depth_nerf.method.integration; sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("shape", [(0, 4, 5), (4, 0), (2, 4, 5)])
+@BOTH
+def test_nothing_valid_is_no_prior(integrate, shape):
+    result = integrate(torch.ones(shape), torch.ones(shape), torch.zeros(shape, dtype=torch.bool))
+    assert result.distance_m.shape == shape
+    assert not result.distance_m.any() and not result.spread_m.any() and not result.mono_share.any()
 
 
 def test_half_precision_and_gradients_do_not_matter():
@@ -381,9 +505,19 @@ def test_sigma_by_hand():
     # σ̂² = spread² + (0.1 · d̂ · share)² + 0.05²
     #   0.09 + (0.1 · 12 · 0.5)² + 0.0025   = 0.4525    root 0.672681
     #   0.0001 + (0.1 · 14 · 1)² + 0.0025   = 1.9626    root 1.400928
-    combined = sigma_m(prior, "combined", mono_m=mono)
-    torch.testing.assert_close(combined, torch.tensor([[0.0, 0.672681, 1.400928]]), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        sigma_m(prior, "combined", mono_m=mono), torch.tensor([[0.0, 0.672681, 1.400928]]), rtol=0, atol=1e-6
+    )
     assert sigma_m(prior, "constant", constant_m=0.5).tolist() == [[0.0, 0.5, 0.5]]
+
+
+@pytest.mark.parametrize("mode", ["constant", "combined"])
+def test_sigma_is_positive_exactly_where_there_is_a_prior(mode):
+    lidar, mono, valid = random_maps(12)
+    prior = integrate_depth(lidar, mono, valid, IntegrationOptions(keep_returns=True))
+    sigma = sigma_m(prior, mode, mono_m=mono)
+    assert torch.isfinite(sigma).all()
+    assert torch.equal(sigma > 0, prior.distance_m > 0)
 
 
 def test_combined_sigma_wants_mono_only_where_it_counts(unchecked_types):

@@ -54,7 +54,7 @@ def one_ray(weights, edges, prior: float, sigma: float, loss_of=edge_loss, **for
 
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-6), (torch.float32, 1e-4)], ids=str)
 @pytest.mark.parametrize(("gaussian", "norm"), FORMS)
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(5))
 def test_equals_twin(seed, gaussian, norm, dtype, rtol):
     rays = random_rays(seed, dtype=dtype)
     loss = edge_loss(**rays, gaussian=gaussian, divide_by_norm=norm)
@@ -63,6 +63,13 @@ def test_equals_twin(seed, gaussian, norm, dtype, rtol):
     assert loss.dtype == dtype
     assert twin > 0
     assert float(loss) == pytest.approx(twin, rel=rtol)
+
+
+@pytest.mark.parametrize(("gaussian", "norm"), FORMS)
+def test_gradient_equals_finite_differences(gaussian, norm):
+    rays = random_rays(1, rays=8, samples=6)
+    weights = (rays.pop("weights") + 0.01).requires_grad_()
+    assert torch.autograd.gradcheck(lambda w: edge_loss(w, **rays, gaussian=gaussian, divide_by_norm=norm), (weights,))
 
 
 def test_value_by_hand():
@@ -78,14 +85,69 @@ def test_value_by_hand():
         assert loss == pytest.approx(value, abs=3e-6)
 
 
+def test_order_of_rays_and_rays_without_prior_do_not_matter():
+    rays = random_rays(2)
+    loss = edge_loss(**rays)
+    order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(edge_loss(**{name: tensor[order] for name, tensor in rays.items()}), loss)
+    with_prior = {name: tensor[6:] for name, tensor in rays.items()}
+    torch.testing.assert_close(edge_loss(**with_prior), loss)
+
+
+@pytest.mark.parametrize(("gaussian", "norm"), FORMS)
+def test_longer_units(gaussian, norm):
+    # all lengths in another unit: Eq. 4 grows with Δt, with the norm it has no unit
+    rays = random_rays(3)
+    scaled = {name: tensor if name == "weights" else 7 * tensor for name, tensor in rays.items()}
+    before, after = (edge_loss(**r, gaussian=gaussian, divide_by_norm=norm) for r in (rays, scaled))
+    torch.testing.assert_close(after, before if norm else 7 * before, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize(("gaussian", "norm"), FORMS)
+def test_weight_at_the_prior_is_best(gaussian, norm):
+    edges = [float(t) for t in range(1, 42)]
+    losses = []
+    for sample in (10, 19, 30):  # 19 spans 20 to 21 m
+        weights = np.full(40, 0.002)
+        weights[sample] = 1 - 39 * 0.002
+        losses.append(one_ray(weights, edges, 20.5, 1.5, gaussian=gaussian, divide_by_norm=norm))
+    assert losses[1] < min(losses[0], losses[2])
+
+
+def test_a_wide_gaussian_pulls_harder_only_without_the_norm():
+    edges = np.linspace(1, 101, 401).tolist()
+    weights = np.full(400, 1 / 400)
+    literal = [one_ray(weights, edges, 50.0, sigma) for sigma in (1.0, 4.0)]
+    assert literal[1] == pytest.approx(4 * literal[0], rel=1e-6)
+    for gaussian in ("point", "interval"):
+        normed = [one_ray(weights, edges, 50.0, sigma, gaussian=gaussian, divide_by_norm=True) for sigma in (1.0, 4.0)]
+        # the Gaussian's integral is 1: the loss is -log of the (equal) weights
+        assert normed == pytest.approx([math.log(400)] * 2, rel=1e-4)
+
+
+@pytest.mark.parametrize("norm", [False, True])
+def test_interval_becomes_point_for_short_samples(norm):
+    for length, rel in ((1.0, 5e-2), (0.1, 1e-3), (0.01, 1e-5), (1e-5, 1e-11)):
+        edges = [10.3, 10.3 + length]
+        interval, point = (
+            one_ray([0.3], edges, 10.0, 1.0, gaussian=gaussian, divide_by_norm=norm)
+            for gaussian in ("interval", "point")
+        )
+        assert interval == pytest.approx(point, rel=rel)
+
+
 def test_interval_of_short_samples_in_float32():
     # 1 mm samples around a prior of 60 m, σ̂ = 12 m: the difference of two values of Φ would keep three digits
     edges = 59.5 + torch.arange(3)[None] * 0.001
     weights, prior = torch.full((1, 2), 0.5), torch.tensor([60.0])
-    losses = []
-    for dtype in (torch.float32, torch.float64):
-        given = weights.to(dtype), edges[:, :-1].to(dtype), edges[:, 1:].to(dtype)
-        losses.append(float(edge_loss(*given, prior, 12.0, gaussian="interval")))
+    losses = [
+        float(
+            edge_loss(
+                weights.to(dtype), edges[:, :-1].to(dtype), edges[:, 1:].to(dtype), prior, 12.0, gaussian="interval"
+            )
+        )
+        for dtype in (torch.float32, torch.float64)
+    ]
     assert losses[0] == pytest.approx(losses[1], rel=1e-6)
 
 
@@ -97,8 +159,10 @@ def test_interval_is_smooth_where_its_two_forms_meet(dtype):
             z = start + (np.arange(1000) + 0.5) / 1000 * length
             expected = math.log(2) * np.exp(-0.5 * z**2).mean() * length
             edges = torch.tensor([[start + 4, start + 4 + length]], dtype=dtype)
-            given = torch.full((1, 1), 0.5, dtype=dtype), edges[:, :1], edges[:, 1:]
-            loss = edge_loss(*given, torch.full((1,), 4.0), 1.0, gaussian="interval")
+            loss = edge_loss(
+                torch.full((1, 1), 0.5, dtype=dtype), edges[:, :1], edges[:, 1:], torch.full((1,), 4.0), 1.0,
+                gaussian="interval",
+            )  # fmt: skip
             assert float(loss) == pytest.approx(expected, rel=1e-4 if dtype == torch.float32 else 1e-6)
 
 
@@ -192,14 +256,22 @@ TERMS = [
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-5), (torch.float32, 1e-3)], ids=str)
 @pytest.mark.parametrize("terms", TERMS, ids=str)
 @pytest.mark.parametrize("sigma_m", [0.05, 0.6, 8.0])
-def test_urban_nerfs_loss_equals_its_twin(sigma_m, terms, dtype, rtol):
-    rays = urban_rays(1, dtype)
+@pytest.mark.parametrize("seed", range(3))
+def test_urban_nerfs_loss_equals_its_twin(seed, sigma_m, terms, dtype, rtol):
+    rays = urban_rays(seed, dtype)
     rays["weights"][:, ::5] = 0
     loss = urban_nerf_loss(**rays, sigma_m=sigma_m, **terms)
     arrays = {name: tensor.numpy().astype(np.float64) for name, tensor in rays.items()}
     twin = reference.urban_nerf_loss(**arrays, sigma_m=sigma_m, **terms)
     assert loss.dtype == dtype and twin > 0
     assert float(loss) == pytest.approx(twin, rel=rtol)
+
+
+@pytest.mark.parametrize("terms", TERMS, ids=str)
+def test_urban_nerfs_gradient_equals_finite_differences(terms):
+    rays = {name: tensor[:8, :10] if tensor.ndim == 2 else tensor[:8] for name, tensor in urban_rays(1).items()}
+    weights = (rays.pop("weights") + 0.01).requires_grad_()
+    assert torch.autograd.gradcheck(lambda w: urban_nerf_loss(w, **rays, sigma_m=4.0, **terms), (weights,))
 
 
 def test_urban_nerfs_terms_by_hand():
@@ -213,6 +285,20 @@ def test_urban_nerfs_terms_by_hand():
     # 3 to 5 m lie in the second sample: 0.1² · 2 - 2 · 0.1 · 1 + ∫K²; without the cut that is 3 / (2√π) = 0.846284,
     # cut at 3σ it is times erf(3) / erf(3/√2)² = 0.999978 / 0.994608
     assert found[2] == pytest.approx(0.02 - 0.2 + 0.846284 * 0.999978 / 0.994608, abs=2e-6)
+
+
+def test_urban_nerfs_loss_is_least_where_light_ends_as_the_kernel_says():
+    edges = np.linspace(1, 9, 801)
+    midpoints = (edges[:-1] + edges[1:]) / 2
+    losses = {}
+    for at in (4.0, 5.0, 6.0):
+        for width in (0.1, 0.3, 0.9):
+            weights = np.exp(-((midpoints - at) ** 2) / (2 * width**2))
+            losses[at, width] = one_ray(weights / weights.sum(), edges.tolist(), 5.0, 0.3, urban_nerf_loss)
+    assert min(losses, key=lambda key: losses[key]) == (5.0, 0.3)
+    # the kernel itself, but for its cut ends: nothing is left
+    assert losses[5.0, 0.3] == pytest.approx(0, abs=1e-2)
+    assert all(value > -1e-9 for value in losses.values())
 
 
 def test_urban_nerfs_loss_does_not_depend_on_how_a_ray_is_cut_into_samples():

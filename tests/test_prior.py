@@ -26,6 +26,14 @@ def maps(height=12, width=10, seed=2):
     return lidar, mono, mask
 
 
+def test_a_prior_is_where_the_mask_is():
+    lidar, mono, mask = maps()
+    prior = make_prior(both(lidar, mono), mask, "integrated", PriorOptions())
+    assert np.array_equal(prior.distance_m > 0, mask)
+    assert np.array_equal(prior.sigma_m > 0, mask)
+    assert (prior.distance_m[mask] > 4.9).all() and (prior.distance_m[mask] < 6.4).all()
+
+
 def test_lidar_alone_is_lidar_and_mono_alone_is_mono():
     lidar, mono, mask = maps()
     only_lidar = make_prior({"lidar": lidar}, mask, "lidar", PriorOptions())
@@ -62,6 +70,13 @@ def test_whatever_changes_makes_another_file(tmp_path, change):
     again = PriorCache(tmp_path, "integrated", options).prior(both(lidar, mono), mask)
     assert len(list(tmp_path.iterdir())) == 2
     assert np.array_equal(again.distance_m, make_prior(both(lidar, mono), mask, "integrated", options).distance_m)
+
+
+def test_a_folder_that_cannot_be_made_is_no_error(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    lidar, mono, mask = maps()
+    prior = PriorCache(tmp_path / "file" / "cache", "integrated", PriorOptions()).prior(both(lidar, mono), mask)
+    assert (prior.distance_m > 0).any()
 
 
 def a_calibration(**changes):
@@ -126,15 +141,18 @@ def test_mono_alone_never_sees_lidar():
 def test_another_calibration_makes_another_file(tmp_path):
     lidar, mono, mask = maps()
     view = level_view(mask.shape)
-    caches = [
-        PriorCache(tmp_path, "integrated", PriorOptions(), each)
-        for each in (a_calibration(), a_calibration(error_model=None))
-    ]
-    first, second = (cache.prior(both(lidar, mono), mask, view) for cache in caches)
+    first = PriorCache(tmp_path, "integrated", PriorOptions(), a_calibration()).prior(both(lidar, mono), mask, view)
+    second = PriorCache(tmp_path, "integrated", PriorOptions(), a_calibration(error_model=None)).prior(
+        both(lidar, mono), mask, view
+    )
     assert len(list(tmp_path.iterdir())) == 2
     assert not np.array_equal(first.sigma_m, second.sigma_m)
     turned = RayAngles(view.theta_rad, view.elevation_rad + 2)
-    assert not caches[0].prior(both(lidar, mono), mask, turned).distance_m.any()
+    assert (
+        not PriorCache(tmp_path, "integrated", PriorOptions(), a_calibration())
+        .prior(both(lidar, mono), mask, turned)
+        .distance_m.any()
+    )
 
 
 def test_the_angles_of_a_picture():
@@ -153,6 +171,12 @@ def test_the_angles_of_a_picture():
 def test_an_unknown_choice(fields, unchecked_types):
     with pytest.raises(InputError, match="expected one of"):
         PriorOptions(**fields)
+
+
+def test_a_mono_map_of_another_size(unchecked_types):
+    lidar, mono, mask = maps()
+    with pytest.raises(InputError, match=r"mono_m \(11, 10\)"):
+        make_prior(both(lidar, mono[1:]), mask, "integrated", PriorOptions())
 
 
 def test_sky_is_above_the_horizon_without_any_distance():

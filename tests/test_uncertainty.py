@@ -24,6 +24,16 @@ def test_it_is_the_spread_of_where_rays_end():
     assert of_edges(weights, edges) == pytest.approx(drawn_std(weights, edges), rel=0.01)
 
 
+def test_a_sample_is_as_unsure_as_it_is_long():
+    assert of_edges(np.array([0, 0.7, 0]), np.array([0.0, 3.0, 3.6, 9.0])) == pytest.approx(0.6 / np.sqrt(12))
+
+
+def test_what_passes_does_not_count():
+    edges = np.array([0.0, 1.0, 2.0, 50.0])
+    weights = np.array([0.1, 0.3, 0.05])
+    assert of_edges(weights, edges) == pytest.approx(of_edges(2 * weights, edges))
+
+
 def test_a_ray_that_nothing_stops_may_end_anywhere():
     assert of_edges(np.zeros(2), np.array([0.0, 1.0, 12.0])) == pytest.approx(12 / np.sqrt(12))
 
