@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -166,7 +167,16 @@ class RoomModel:
         world = (origins / place.units_per_metre - place.shift_m) @ place.rotation + self.world_offset_m
         distance, _ = wall_distance(world, directions @ place.rotation)
         depth = torch.from_numpy((distance + self.off_m) * place.units_per_metre)[..., None]
-        return {"depth": depth.float(), "accumulation": torch.ones_like(depth).float()}
+        ones = torch.ones_like(depth).float()
+        return {"depth": depth.float(), "accumulation": ones, "rgb": 0.2 * ones.expand(*ones.shape[:-1], 3)}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def the_room_has_no_networks() -> Iterator[None]:
+    """Lengths are its outputs; test_rendering.py tries those of a field."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Caster, "_lengths", lambda caster, rays: caster._model.get_outputs_for_camera_ray_bundle(rays))
+        yield
 
 
 @pytest.fixture

@@ -254,3 +254,19 @@ def test_what_is_not_covered_is_rendered_step_by_step(case, monkeypatch):
     used = []
     monkeypatch.setattr(rendering_numba, "render", lambda *_: used.append(1))
     assert model(bundle())["rgb"].isfinite().all() and not used
+
+
+@pytest.mark.parametrize("implementation", ["fused", "torch"])
+@pytest.mark.parametrize("reach_m", [None, 8.0])
+def test_lengths_are_the_same_without_colours(implementation: str, reach_m: float | None) -> None:
+    """In parts of 16 rays; of nerfstudio's own field, too."""
+    model = build(implementation=implementation, eval_num_rays_per_chunk=16).eval()
+    rng = np.random.default_rng(0)
+    origin_m, along = rng.uniform(-3, 3, (40, 3)), rng.normal(size=(40, 3))
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    caster = Caster(model, SceneToModel(np.eye(3), np.zeros(3), 1 / 20))
+    coloured, alone = (caster.cast(origin_m, along, reach_m, colours) for colours in (True, False))
+    assert alone.rgb is None and coloured.rgb is not None and coloured.rgb.shape == (40, 3)
+    np.testing.assert_allclose(alone.distance_m, coloured.distance_m, rtol=1e-5)
+    np.testing.assert_allclose(alone.hit, coloured.hit, atol=1e-5)
+    assert np.ptp(alone.distance_m) > 0 and (0 < alone.hit).all()

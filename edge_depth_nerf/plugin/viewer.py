@@ -394,8 +394,8 @@ class DriveLayers(ViewerControl):
             cast = Caster(model, place).cast(origin_m, along, colours=True)
         points_m = origin_m + along * cast.distance_m[:, None]
         error_m = np.abs(cast.distance_m - rays.distance_m[chosen])
-        rgb = np.zeros((len(chosen), 3)) if cast.rgb is None else cast.rgb.clip(0, 1)
-        colours = (255 * rgb).round().astype(np.uint8)
+        assert cast.rgb is not None
+        colours = (255 * cast.rgb.clip(0, 1)).round().astype(np.uint8)
         return Cloud(place.points(points_m).astype(np.float32), colours, points_m[:, 2], error_m)
 
     def _cloud(
