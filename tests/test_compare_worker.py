@@ -7,7 +7,9 @@ import math
 import re
 import shutil
 import subprocess
+import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 from xml.etree import ElementTree
@@ -21,7 +23,7 @@ from numba import njit
 from numba.core.event import install_listener
 
 from edge_depth_nerf.base.files import read_image, read_json, write_json
-from edge_depth_nerf.compare import command, tables
+from edge_depth_nerf.compare import command, tables, worker
 from edge_depth_nerf.compare.worker import Clock
 
 pytestmark = pytest.mark.slow
@@ -32,17 +34,23 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("compare")
     scene, both = write_compared_scene(folder / "sample"), ("nerfacto", "edge")
     asked = options(scene, output=folder / "out", methods=both, steps=6, jobs=2, detail=True)
-    return asked, command.compare(asked, QUIET)
+    do_runs = command.do_runs
+
+    def do_one_in_a_process(runs: Sequence[command.Run], *given: Any) -> None:
+        do_runs([run for run in runs if run.specification.method == "nerfacto"], *given)
+        run_here([run for run in runs if run.specification.method == "edge"])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command, "do_runs", do_one_in_a_process)
+        return asked, command.compare(asked, QUIET)
 
 
 def test_it_leaves_figures_tables_and_pictures(finished):
     asked, results = finished
     with (asked.output / "results.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert {(row["scene"], row["method"], row["seed"]) for row in rows} == {
-        ("sample", "nerfacto", "0"),
-        ("sample", "edge", "0"),
-    }
+    runs = {(row["scene"], row["method"], row["seed"]) for row in rows}
+    assert runs == {("sample", "nerfacto", "0"), ("sample", "edge", "0")}
     metrics = {row["metric"] for row in rows if row["method"] == "edge"}
     assert {"masked_psnr", "truth_masked_ssim", "truth_affine_masked_psnr", "truth_abs_rel", "seconds"} <= metrics
     assert {"shifted_1m_masked_psnr", "shifted_2m_masked_psnr", "shifted_1m_truth_abs_rel"} <= metrics
@@ -167,9 +175,18 @@ def test_an_interrupted_run_goes_on_at_its_checkpoint(finished, tmp_path, monkey
     progress = read_json(folder / "progress.json")
     progress["times"] = {"4": {"seconds": 100.0, "cpu_seconds": 50.0}}
     write_json(folder / "progress.json", progress)
-    monkeypatch.setattr(command, "do_runs", run_here)
+    begun = []
+
+    def work(runs: Sequence[command.Run], *_: object) -> None:
+        for run in runs:
+            monkeypatch.setattr(sys, "argv", ["worker", str(run.folder.absolute())])
+            worker.main()
+
+    monkeypatch.setattr(worker, "end_with_parent", lambda: begun.append("ends with its parent"))
+    monkeypatch.setattr(command, "do_runs", work)
     monkeypatch.setattr(command, "draw_plots", lambda *_: [])
     again = command.compare(replace(asked, output=output), QUIET)
+    assert begun == ["ends with its parent"]
     before, after = (next(run for run in found.runs if run.method == "edge") for found in (results, again))
     assert [path.name for path in checkpoints.iterdir()] == ["step-000000005.ckpt"]
     steps = [point["step"] for point in before.curve]
@@ -177,9 +194,10 @@ def test_an_interrupted_run_goes_on_at_its_checkpoint(finished, tmp_path, monkey
     assert after.curve[: steps.index(4.0) + 1] == before.curve[: steps.index(4.0) + 1]
     assert after.curve[-1] != before.curve[-1]
     assert 100 < after.figures["seconds"] < 100 + before.figures["seconds"] + 60
-    assert {row["value"] for row in again.rows() if row["method"] == "nerfacto"} == {
-        row["value"] for row in results.rows() if row["method"] == "nerfacto"
-    }
+    ended, resumed = (
+        {row["value"] for row in found.rows() if row["method"] == "nerfacto"} for found in (results, again)
+    )
+    assert ended == resumed
 
 
 def test_the_clock_stands_while_kernels_are_compiled():
