@@ -90,21 +90,8 @@ def test_a_sealed_file_is_whole_or_not_there(tmp_path: Path) -> None:
     assert not is_whole(tmp_path / "none", 3) and content_of(tmp_path / "none", 3) is None
 
 
-def spoil(path: Path, how: str) -> None:
-    content = bytearray(path.read_bytes())
-    if how == "cut":
-        content = content[: len(content) // 2]
-    elif how == "flipped":
-        content[len(content) // 2] ^= 16
-    elif how == "of another version":
-        content[-8] ^= 1  # the seal: mark, version, checksum
-    else:
-        content = bytearray()
-    path.write_bytes(content)
-
-
-@pytest.mark.parametrize("how", ["cut", "flipped", "of another version", "empty"])
-def test_a_spoiled_cache_is_made_again(tmp_path: Path, how: str) -> None:
+@pytest.mark.parametrize("of_the_seal", [False, True])
+def test_a_spoiled_cache_is_made_again(tmp_path: Path, of_the_seal: bool) -> None:
     scene = write_scene(tmp_path, frames=3)
     config = FisheyeDepthDataManagerConfig(dataparser=FisheyeDepthDataParserConfig(data=scene))
 
@@ -116,11 +103,11 @@ def test_a_spoiled_cache_is_made_again(tmp_path: Path, how: str) -> None:
     whole = first_batch()
     for kind in ("prior", "rays", "pixels"):
         folder = scene / ".cache" / kind
-        files = sorted(folder.glob("*.np[yz]"))
-        before = {path: path.read_bytes() for path in files}
+        before = {path: path.read_bytes() for path in sorted(folder.glob("*.np[yz]"))}
         assert before, kind
-        for path in files:
-            spoil(path, how)
+        for path, content in before.items():
+            place = len(content) - 8 if of_the_seal else len(content) // 2
+            path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
         if kind == "prior":
             shutil.rmtree(scene / ".cache" / "pixels")  # or nobody would look at them
         assert all(torch.equal(now, then) for now, then in zip(first_batch(), whole, strict=True)), kind
@@ -166,7 +153,7 @@ def test_the_files_used_last_are_kept(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == [".being_written.npy", "2.npy", "3.npy"]
 
 
-def test_leftovers_of_killed_processes_alone_are_removed(tmp_path: Path) -> None:
+def test_leftovers_of_killed_processes_alone_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     here = platform.node()
     left = {
         f".a.{here}~{DEAD}~7.png": False,
@@ -182,15 +169,13 @@ def test_leftovers_of_killed_processes_alone_are_removed(tmp_path: Path) -> None
     os.utime(old, (0, 0))
     remove_leftovers(tmp_path)
     assert {name: (tmp_path / name).exists() for name in left} == left and not old.exists()
-
-
-def test_a_file_that_is_being_written_has_such_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # a file that is being written has such a name
     seen = []
     monkeypatch.setattr(os, "replace", lambda temporary, path: seen.append(temporary))
-    write_text(tmp_path / "a.json", "{}")
-    (tmp_path / seen[0].name.replace(f"~{os.getpid()}~", f"~{DEAD}~")).write_bytes(b"")
-    remove_leftovers(tmp_path)
-    assert not list(tmp_path.iterdir())
+    write_text(tmp_path / "x" / "a.json", "{}")
+    (tmp_path / "x" / seen[0].name.replace(f"~{os.getpid()}~", f"~{DEAD}~")).write_bytes(b"")
+    remove_leftovers(tmp_path / "x")
+    assert not list((tmp_path / "x").iterdir())
 
 
 def test_the_same_weights_are_the_same_bytes(tmp_path: Path) -> None:
@@ -238,64 +223,54 @@ def test_a_folder_that_nothing_was_written_to_is_taken_away(tmp_path: Path) -> N
     assert not (tmp_path / "a").exists()
 
 
-BOTH_AT_ONCE = """
-import os, sys
-import edge_depth_nerf.process.command, edge_depth_nerf.process.kitti360.converter  # once for both
-from edge_depth_nerf.entry import main
-children = []
-for said in sys.argv.pop(1), sys.argv.pop(1):
-    children.append(os.fork())
-    if not children[-1]:
-        for stream in 1, 2:
-            os.dup2(os.open(said, os.O_WRONLY | os.O_CREAT | os.O_APPEND), stream)
-        main()
-        sys.stdout.flush()
-        os._exit(0)
-assert [os.waitpid(child, 0)[1] for child in children] == [0, 0]
-"""
-
-
-def test_two_processes_on_one_scene(room: RoomDrive, whole: dict[str, bytes], tmp_path: Path) -> None:
-    logs = [tmp_path / name for name in ("one", "other")]
-    command = [sys.executable, "-c", BOTH_AT_ONCE, *logs, *words_of(room), "--output", tmp_path / "scene"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    said = [log.read_text() for log in logs]
-    assert done.returncode == 0, (done.stderr, said)
-    assert sum("all of them were there" in text for text in said) == 1
-    assert contents(tmp_path / "scene") == whole
-
-
 # ---- killed ----------------------------------------------------------------------------------------------------
-DIE_AT_REPLACE = """
+FORKS = """
 import os, sys
 from pathlib import Path
-import edge_depth_nerf.process.command, edge_depth_nerf.process.kitti360.converter  # once for all
 from edge_depth_nerf.entry import main
-replace, lasts, scene = os.replace, sys.argv.pop(1).split(), Path(sys.argv.pop(1))
-sys.argv += ["--output", str(scene)]
-for last in lasts:
+
+folder, lasts = Path(sys.argv.pop(1)), sys.argv.pop(1).split()
+sys.argv += ["--output", str(folder / "whole")]
+main()  # what it imports, and what it finds of lenses, is there for all
+replace = os.replace
+
+def begin(name, log, last=None):
+    child = os.fork()
+    if child:
+        return child
+
     def dying(temporary, path):
-        if str(path).endswith(last):
+        if last and str(path).endswith(last):
             os.kill(os.getpid(), 9)
         return replace(temporary, path)
-    child = os.fork()
-    if not child:
-        os.replace = dying
-        main()
-        os._exit(0)
-    assert os.waitpid(child, 0)[1] == 9, last
-    assert not (scene / "transforms.json").exists(), last
+
+    for stream in 1, 2:
+        os.dup2(os.open(folder / log, os.O_WRONLY | os.O_CREAT | os.O_APPEND), stream)
+    os.replace, sys.argv[-1] = dying, str(folder / name)
+    main()
+    sys.stdout.flush()
+    os._exit(0)
+
+for last in lasts:
+    assert os.waitpid(begin("killed", "killed.log", last), 0)[1] == 9, last
+    assert not (folder / "killed" / "transforms.json").exists(), last
+both = [begin("both", log) for log in ("one.log", "other.log")]
+assert [os.waitpid(child, 0)[1] for child in both] == [0, 0]
 """
 
 
-def test_process_killed_before_a_file_appears(room: RoomDrive, whole: dict[str, bytes], tmp_path: Path) -> None:
-    """One run, killed again and again, each time further on."""
+def test_process_killed_before_a_file_appears_and_two_on_one_scene(
+    room: RoomDrive, whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    """One run, killed again and again, each time further on; and another scene that two write at once."""
     lasts = "process.json image_03/0000000003.npz points.ply transforms.json"
-    command = [sys.executable, "-c", DIE_AT_REPLACE, lasts, tmp_path / "scene", *words_of(room)]
+    command = [sys.executable, "-c", FORKS, tmp_path, lasts, *words_of(room)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    process(options_of(room, tmp_path / "scene"), Console(quiet=True))
-    assert contents(tmp_path / "scene") == whole
+    said = [log.read_text() for log in sorted(tmp_path.glob("*.log"))]
+    assert done.returncode == 0, (done.stderr, said)
+    process(options_of(room, tmp_path / "killed"), Console(quiet=True))
+    assert contents(tmp_path / "killed") == contents(tmp_path / "both") == whole
+    assert sum("all of them were there" in text for text in said[1:]) == 1
 
 
 def test_weights_that_were_read_predict_what_trained_ones_did(sample_drive: Path) -> None:
@@ -330,8 +305,13 @@ def test_the_newest_whole_checkpoint_is_taken(tmp_path: Path) -> None:
 
 
 # ---- disks -----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
-def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [(errno.ENOSPC, "free some space"), (errno.EROFS, "read-only"), (errno.EACCES, "has no permission")],
+)
+def test_a_file_that_cannot_be_written_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, words: str
+) -> None:
     write_bytes(tmp_path / "a.bin", b"before")
 
     def refuse(*_: object) -> None:
@@ -343,10 +323,7 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, number: int, mon
     monkeypatch.undo()
     assert contents(tmp_path) == {"a.bin": b"before"}
     said = explain(error.value)
-    assert said.startswith(f"{tmp_path / 'a.bin'}: {os.strerror(number)}. ") and "\n" not in said
-    assert {errno.ENOSPC: "free some space", errno.EROFS: "read-only", errno.EACCES: "has no permission"}[
-        number
-    ] in said
+    assert said.startswith(f"{tmp_path / 'a.bin'}: {os.strerror(number)}. ") and words in said and "\n" not in said
 
 
 def test_a_full_disk_and_then_a_larger_one(
