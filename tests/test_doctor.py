@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError
 from typing import Any
 
 import pytest
+import torch
 from interpreted import NEEDS_A_GPU
 from rich.console import Console
 
@@ -26,9 +27,8 @@ def test_it_is_content_with_this_environment(capsys):
     """This environment passes the tests, so there is nothing to mend."""
     status, said = run_doctor(Console(width=200)), capsys.readouterr().out
     assert status == 0 and "Nothing to fix" in said, said
-    named = "Python PyTorch Device nerfstudio Methods OpenCV LPIPS"
-    for what in ("Hash grids", "Free memory", *named.split()):
-        assert what in said
+    named = ("Hash grids", "Free memory", "Python", "PyTorch", "Device", "nerfstudio", "Methods", "OpenCV", "LPIPS")
+    assert all(what in said for what in named)
 
 
 @pytest.mark.parametrize(
@@ -46,12 +46,10 @@ def test_one_problem_is_enough_for_the_exit_status(monkeypatch, capsys, finding,
     assert all(word in said for word in words)
 
 
-@pytest.mark.parametrize(
-    ("running", "state"), [((3, 9), "problem"), ((3, 10), "ok"), ((3, 12), "ok"), ((3, 13), "problem")]
-)
-def test_pythons(monkeypatch, running, state):
-    monkeypatch.setattr(sys, "version_info", (*running, 0))
-    assert found(doctor.check_python)["Python"].state == state
+def test_pythons(monkeypatch):
+    for minor, state in ((9, "problem"), (10, "ok"), (12, "ok"), (13, "problem")):
+        monkeypatch.setattr(sys, "version_info", (3, minor, 0))
+        assert found(doctor.check_python)["Python"].state == state
 
 
 def test_missing_libraries_are_findings(monkeypatch):
@@ -59,36 +57,25 @@ def test_missing_libraries_are_findings(monkeypatch):
     monkeypatch.setattr(doctor, "find_spec", lambda name: None if name in hidden else spec(name))
     hidden = {"pycolmap", "kiss_icp", "transformers", "rosbags", "distributed", "tinycudann", "numba"}
     extras = found(doctor.check_extras)
-    for name, extra in (
-        ("COLMAP", "colmap"),
-        ("KISS-ICP", "odometry"),
-        ("transformers", "hf"),
-        ("rosbags", "bags"),
-        ("Dask", "cluster"),
-    ):
+    names = {"COLMAP": "colmap", "KISS-ICP": "odometry", "transformers": "hf", "rosbags": "bags", "Dask": "cluster"}
+    for name, extra in names.items():
         assert extras[name].state == "note" and f"'.[{extra}]'" in extras[name].remedy
     assert found(doctor.check_kernels)["Hash grids"].state == "problem"
-    hidden.remove("numba")
+    hidden -= {"numba", "pycolmap"}
     assert found(doctor.check_kernels)["Hash grids"].state == "ok"
-
-
-def test_a_module_of_another_package(monkeypatch):
-    """pycolmap-cuda12 installs the module pycolmap."""
 
     def version(name: str) -> str:
         raise PackageNotFoundError(name)
 
+    # pycolmap-cuda12 installs the module pycolmap
     monkeypatch.setattr(doctor, "version", version)
     assert found(doctor.check_extras)["COLMAP"].found == "installed"
 
 
-def test_methods_that_are_not_registered(monkeypatch):
+def test_methods_that_are_not_registered_and_another_nerfstudio(monkeypatch):
     monkeypatch.setattr(doctor, "entry_points", lambda **_: [])
     finding = found(doctor.check_nerfstudio)["Methods"]
     assert finding.state == "problem" and "edge-depth-nerf-lite" in finding.found and "pip install" in finding.remedy
-
-
-def test_another_nerfstudio(monkeypatch):
     monkeypatch.setattr(doctor, "version", lambda _: "1.2.0")
     assert found(doctor.check_nerfstudio)["nerfstudio"].state == "problem"
 
@@ -116,28 +103,26 @@ def test_an_opencv_that_does_not_load_and_one_that_does(monkeypatch, tmp_path):
     assert finding.state == "ok" and finding.found.startswith("4.10; installed: ")
 
 
-@pytest.mark.parametrize(("free_gb", "state"), [(1.0, "problem"), (16.0, "ok")])
-def test_memory(monkeypatch, free_gb, state):
-    monkeypatch.setattr(doctor, "_free_memory_gb", lambda: free_gb)
-    assert found(doctor.check_room)["Free memory"].state == state
+def test_memory(monkeypatch):
+    for free_gb, state in ((1.0, "problem"), (16.0, "ok")):
+        monkeypatch.setattr(doctor, "_free_memory_gb", lambda free_gb=free_gb: free_gb)
+        assert found(doctor.check_room)["Free memory"].state == state
 
 
 def test_a_driver_without_a_usable_gpu(monkeypatch):
-    import torch
-
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(
-        doctor.shutil, "which", lambda name, **_: "/usr/bin/nvidia-smi" if name == "nvidia-smi" else None
-    )
+    monkeypatch.setattr(doctor.shutil, "which", lambda name, **_: {"nvidia-smi": "/usr/bin/nvidia-smi"}.get(name))
     assert found(doctor.check_torch)["Device"].state == "problem"
     monkeypatch.setattr(doctor.shutil, "which", lambda *_, **__: None)
     device = found(doctor.check_torch)["Device"]
     assert device.state == "note" and "edge-depth-nerf-lite" in device.remedy
+    # nothing is tried on it, nor without PyTorch
+    assert found(doctor.check_gpu) == {}
+    monkeypatch.setitem(sys.modules, "torch", None)
+    assert found(doctor.check_gpu) == {}
 
 
 def test_a_gpu_is_named_with_its_memory_and_versions(monkeypatch):
-    import torch
-
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "NVIDIA H200")
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (100 << 30, 140 << 30))
@@ -159,8 +144,6 @@ def test_a_gpu_is_named_with_its_memory_and_versions(monkeypatch):
 @pytest.fixture
 def as_gpu(monkeypatch):
     """The CPU in a GPU's place, kernels that are their formulas, and graphs that are replayed."""
-    import torch
-
     right = [replace(form, load=lambda form=form: form.formula) for form in losses.step_kernels()]
     monkeypatch.setattr(losses, "step_kernels", lambda: right)
     monkeypatch.setattr(doctor, "_gpu", lambda: torch.device("cpu"))
@@ -168,13 +151,11 @@ def as_gpu(monkeypatch):
     return right
 
 
-def test_a_gpu_on_which_all_works(as_gpu):
+def test_a_gpu_on_which_all_works_and_one_with_wrong_kernels(as_gpu):
     every = found(doctor.check_gpu)
     assert {name: each.state for name, each in every.items()} == {"GPU kernels": "ok", "CUDA graphs": "ok"}
     assert every["GPU kernels"].found.startswith(f"{len(as_gpu)} of {len(as_gpu)} give the numbers of their formulas")
 
-
-def test_kernels_that_are_wrong_on_a_gpu_are_named(as_gpu):
     def broken() -> Any:
         raise RuntimeError("no C compiler\nfound")
 
@@ -189,38 +170,20 @@ def test_kernels_that_are_wrong_on_a_gpu_are_named(as_gpu):
     assert kernels.found.endswith(f"{as_gpu[1].name} (RuntimeError: no C compiler)")
 
 
-@pytest.mark.parametrize(
-    ("sums", "words"),
-    [
-        (RuntimeError("CUDA error: operation not permitted\nwhen stream is capturing"), "cannot be recorded"),
-        ([8.0, 8.0], "are replayed with wrong results"),
-    ],
-    ids=["not recorded", "wrong"],
-)
-def test_graphs_that_do_not_work(as_gpu, monkeypatch, sums, words):
-    def replayed(_: Any) -> Any:
-        if isinstance(sums, Exception):
-            raise sums
-        return sums
+def test_graphs_that_do_not_work(as_gpu, monkeypatch):
+    def refused(_: Any) -> Any:
+        raise RuntimeError("CUDA error: operation not permitted\nwhen stream is capturing")
 
-    monkeypatch.setattr(doctor, "replayed_sums", replayed)
-    graphs = found(doctor.check_gpu)["CUDA graphs"]
-    assert graphs.state == "note" and words in graphs.found and "\n" not in graphs.found
-    assert "CUDA_LAUNCH_BLOCKING" in graphs.remedy
-    assert isinstance(sums, list) or "operation not permitted" in graphs.found
-
-
-def test_without_a_gpu_nothing_is_tried(monkeypatch):
-    import torch
-
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert found(doctor.check_gpu) == {}
-    monkeypatch.setitem(sys.modules, "torch", None)  # which is not there
-    assert found(doctor.check_gpu) == {}
+    for replayed, words in (
+        (refused, ("cannot be recorded", "operation not permitted")),
+        (lambda _: [8.0, 8.0], ("are replayed with wrong results",)),
+    ):
+        monkeypatch.setattr(doctor, "replayed_sums", replayed)
+        graphs = found(doctor.check_gpu)["CUDA graphs"]
+        assert graphs.state == "note" and "\n" not in graphs.found and "CUDA_LAUNCH_BLOCKING" in graphs.remedy
+        assert all(word in graphs.found for word in words)
 
 
 @NEEDS_A_GPU
 def test_a_graph_is_replayed_on_a_gpu():
-    import torch
-
     assert doctor.replayed_sums(torch.device("cuda", 0)) == [8.0, 24.0]
