@@ -9,27 +9,29 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
-from comparisons import write_compared_scene
+from comparisons import fake
 from drives import SEQUENCE, RoomDrive, write_room_drive
 from rich.console import Console
+from scenes import write_scene
 from waiting import until
 
 from edge_depth_nerf import cli
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_json
+from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.compare import command as comparing
 from edge_depth_nerf.compare.command import compare
 from edge_depth_nerf.compare.options import CompareOptions
+from edge_depth_nerf.compare.specification import FIGURES
 from edge_depth_nerf.jobs import cluster
 from edge_depth_nerf.jobs.cluster import on_cluster
 from edge_depth_nerf.jobs.cluster_address import check_address
-from edge_depth_nerf.jobs.tasks import Task, do_tasks, own_command
+from edge_depth_nerf.jobs.tasks import Task, do_tasks, own_command, this_machine
 from edge_depth_nerf.mono import many
 from edge_depth_nerf.mono.estimate import estimate_depth
 from edge_depth_nerf.mono.many import estimate_on_cluster
@@ -110,6 +112,17 @@ def test_nobody_at_an_address_is_told(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 # ---- processes on this machine -------------------------------------------------------------------------------------
+def test_jobs_without_a_cluster_go_side_by_side(tmp_path: Path) -> None:
+    """Each waits for what the other begins."""
+    waits = (
+        "end = time.monotonic() + 60\nwhile len(list(kept.parent.glob('*.kept'))) < 2: assert time.monotonic() < end\n"
+    )
+    tasks = [steps(tmp_path, name, code=STEPS + waits) for name in "ab"]
+    with this_machine(2, len(tasks), QUIET) as place:
+        do_tasks(tasks, place, QUIET)
+    assert all((tmp_path / f"{name}.kept").read_text() == "0 1 2 3 " for name in "ab")
+
+
 @pytest.mark.slow
 def test_a_killed_workers_task_goes_on_where_it_was(tmp_path: Path) -> None:
     console = Console(file=io.StringIO(), width=200)
@@ -291,7 +304,7 @@ def test_a_command_line_gives_the_options_back(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> RoomDrive:
-    drive = write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=10, beams=800, size=32)
+    drive = write_room_drive(tmp_path_factory.mktemp("room") / "drive", frames=7, beams=800, size=32)
     # a frame without pose, one without sweep
     poses = drive.poses_file().read_text().splitlines()
     drive.poses_file().write_text("\n".join([*poses[:3], *poses[4:]]) + "\n")
@@ -307,28 +320,28 @@ def options_of(room: RoomDrive, output: Path, **changes: Any) -> Kitti360Options
 
 @pytest.mark.slow
 def test_a_drive_is_cut_as_by_hand(room: RoomDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Eight frames of ten can be used: 1, 2, 4 to 9."""
-    by_hand = {"000": (1, 5), "001": (6, 4)}
+    """Five frames of seven can be used: 1, 2, 4 to 6."""
+    by_hand = {"000": (1, 4), "001": (5, 2)}
     for name, (first, frames) in by_hand.items():
         process(options_of(room, tmp_path / "hand" / name, first=first, frames=frames), QUIET)
-    cut = process_drive(options_of(room, tmp_path / "here", frames_per_scene=5), QUIET)
+    cut = process_drive(options_of(room, tmp_path / "here", frames_per_scene=3), QUIET)
     assert [path.name for path in cut] == list(by_hand)
     console = Console(file=io.StringIO(), width=200)
-    process_drive(options_of(room, tmp_path / "there", frames_per_scene=5, cluster="local"), console)
-    assert "8 usable frames, split into 2 scenes" in console.file.getvalue()  # pyright: ignore
+    process_drive(options_of(room, tmp_path / "there", frames_per_scene=3, cluster="local"), console)
+    assert "5 usable frames, split into 2 scenes" in console.file.getvalue()  # pyright: ignore
     wanted = files_of(tmp_path / "hand")
-    assert len([name for name in wanted if name.endswith(".png") and "/images/" in name]) == 2 * 8
+    assert len([name for name in wanted if name.endswith(".png") and "/images/" in name]) == 2 * 5
     assert files_of(tmp_path / "here") == wanted and files_of(tmp_path / "there") == wanted
     frames = [
         (frame["file_path"], name)
         for name in by_hand
         for frame in read_json(tmp_path / "there" / name / "transforms.json")["frames"]
     ]
-    scenes_of = {number: {name for path, name in frames if f"{number:010d}" in path} for number in range(10)}
-    assert {number for number, scenes in scenes_of.items() if scenes} == {1, 2, 4, 5, 6, 7, 8, 9}
+    scenes_of = {number: {name for path, name in frames if f"{number:010d}" in path} for number in range(7)}
+    assert {number for number, scenes in scenes_of.items() if scenes} == {1, 2, 4, 5, 6}
     assert all(len(scenes) <= 1 for scenes in scenes_of.values())
     with pytest.raises(InputError, match="is a scene; --frames-per-scene would write other scenes into it"):
-        process_drive(options_of(room, tmp_path / "here" / "000", frames_per_scene=5), QUIET)
+        process_drive(options_of(room, tmp_path / "here" / "000", frames_per_scene=3), QUIET)
 
     # the scenes' maps: of one network, trained by one task; each task does its words, as the scenes' did above
     did: list[str] = []
@@ -350,28 +363,34 @@ def test_a_drive_is_cut_as_by_hand(room: RoomDrive, tmp_path: Path, monkeypatch:
     estimate_on_cluster(EstimateDepthOptions(scenes["there"], train_steps=2, cluster="local"), QUIET)
     assert weights(tmp_path / "there") == weights(tmp_path / "here")
     here, there = files_of(tmp_path / "here"), files_of(tmp_path / "there")
-    assert len([name for name in there if "/mono/" in name]) == 2 * 8
+    assert len([name for name in there if "/mono/" in name]) == 2 * 5
     assert there == here
     assert did == ["depth network", *(f"maps of {path}" for path in scenes["there"])]
 
 
 @pytest.mark.slow
 def test_a_comparison_goes_on_when_a_worker_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_compared_scene(tmp_path / "sample")
+    """The training is made up; test_compare_worker.py resumes one for real."""
+
+    def task(run: comparing.Run) -> Task:
+        made_up, figures = run.folder / "made_up.json", run.folder / FIGURES
+        write_json(made_up, {**fake("sample", "edge", 0).content, "run": asdict(run.specification)})
+        code = STEPS.replace("made.touch()", f"Path({str(made_up)!r}).rename({str(figures)!r})")
+        return replace(steps(run.folder, "edge", 0.3, code, trains=True), title=run.title, log=run.log, makes=figures)
+
+    write_scene(tmp_path / "sample")
     output = tmp_path / "out"
     asked = CompareOptions(scenes=(tmp_path / "sample",), output=output, methods=("edge",), steps=2, cluster="local")
+    monkeypatch.setattr(comparing.Run, "task", property(task))
     monkeypatch.setattr(comparing, "draw_plots", lambda *_: [])
     folder = output / "runs" / "sample" / "edge_seed-0"
-    killer = kill_worker_of(str(folder), lambda: list(folder.rglob("nerfstudio_models/step-000000001.ckpt")))
+    killer = kill_worker_of(str(folder), (folder / "edge.kept").exists)
     console = Console(file=io.StringIO(), width=200)
     results = compare(asked, console)
     killer.join()
     assert "sample edge seed 0: worker lost" in console.file.getvalue()  # pyright: ignore
     assert [run.method for run in results.runs] == ["edge"]
-    said = (folder / "run.log").read_text()
-    first, second = said.split("$ ")[1:]
-    assert "No Nerfstudio checkpoint to load" in first and "Done loading Nerfstudio checkpoint" in second
-    assert list(read_json(folder / "progress.json")["times"]) == ["2"]
+    assert (folder / "run.log").read_text().count("$ ") == 2 and (folder / "edge.kept").read_text() == "0 1 2 3 "
     # what is done is done: the same tables come from the same command without a cluster
     tables = (output / "tables.md").read_text()
     compare(replace(asked, cluster=None), QUIET)
