@@ -11,19 +11,19 @@ from models import pipeline_of
 from nerfstudio.engine.optimizers import Optimizers
 from scenes import transforms, write_scene
 
-from edge_depth_nerf.base.files import read_json, write_json, write_mask
+from edge_depth_nerf.base.files import write_mask
 from edge_depth_nerf.compare.evaluation import (
     ViewEvaluator,
     choose_pixels,
     evaluate_beams,
     evaluate_pixels,
-    evaluated,
     shifted_views,
 )
 from edge_depth_nerf.compare.figures import affine_fitted
 from edge_depth_nerf.method.edges import EdgeRecall, depth_edges_found, picture_edges_found
 from edge_depth_nerf.method.metrics import masked_psnr
 from edge_depth_nerf.plugin.config import make_specifications, read_method_file
+from edge_depth_nerf.plugin.evaluation import evaluated
 
 
 def test_evaluation_leaves_no_trace_in_a_training(tmp_path):
@@ -59,8 +59,12 @@ def test_evaluation_leaves_no_trace_in_a_training(tmp_path):
     assert of_trained[0]["psnr"] != figures[0]["psnr"] and of_trained[0] != of_trained[-1]
 
 
-def test_pixels_of_a_few_views_are_spread_evenly(tmp_path):
-    pipeline = pipeline_of(write_scene(tmp_path))
+@pytest.fixture(scope="module")
+def pipeline(tmp_path_factory):
+    return pipeline_of(with_shifted_views(write_scene(tmp_path_factory.mktemp("scene"))))
+
+
+def test_pixels_of_a_few_views_are_spread_evenly(pipeline):
     dataset = pipeline.datamanager.train_dataset
     every = [int(view.indices[0, 0]) for view in choose_pixels(dataset, per_view=2)]
     assert every == [*range(len(dataset))]
@@ -83,8 +87,7 @@ def test_a_view_without_a_usable_pixel_is_passed_over(tmp_path):
     assert math.isfinite(evaluate_pixels(pipeline, chosen, trained_on=True)["psnr"])
 
 
-def test_the_pixels_are_always_the_same_and_inside_the_mask(tmp_path):
-    pipeline = pipeline_of(write_scene(tmp_path))
+def test_the_pixels_are_always_the_same_and_inside_the_mask(pipeline):
     dataset = pipeline.datamanager.eval_dataset
     one, other = choose_pixels(dataset, most=40), choose_pixels(dataset, most=40)
     assert torch.equal(one[0].indices, other[0].indices)
@@ -114,11 +117,9 @@ def with_shifted_views(scene):
     return scene
 
 
-def test_shifted_views_stand_where_the_scene_says(tmp_path):
-    scene = with_shifted_views(write_scene(tmp_path))
-    pipeline = pipeline_of(scene)
+def test_shifted_views_stand_where_the_scene_says(pipeline):
     dataset = pipeline.datamanager.eval_dataset
-    views = shifted_views(scene, dataset)
+    views = shifted_views(dataset.scene.path.parent, dataset)
     assert [len(views[metres]) for metres in ("0", "1")] == [1, 1]
     same, beside = (views[metres][0]() for metres in ("0", "1"))
     assert torch.allclose(same.camera.camera_to_worlds[0], dataset.cameras[0].camera_to_worlds, atol=1e-6)
@@ -129,15 +130,15 @@ def test_shifted_views_stand_where_the_scene_says(tmp_path):
     assert (same.batch["truth_distance_m"] > 0).any()
 
 
-def test_shifted_views_have_the_figures_of_the_whole_picture(tmp_path):
+def test_shifted_views_have_the_figures_of_the_whole_picture(pipeline, monkeypatch):
     """Only what lies inside the mask is rendered: the figures are those of a rendering of everything."""
-    scene = with_shifted_views(write_scene(tmp_path))
-    pipeline = pipeline_of(scene)
     model, dataset = pipeline.model, pipeline.datamanager.eval_dataset
     rendered, original = [], model.forward
-    model.forward = lambda ray_bundle: (rendered.append(len(ray_bundle)), original(ray_bundle))[1]
-    model.config.eval_num_rays_per_chunk = 100
-    views, told = shifted_views(scene, dataset), []
+    monkeypatch.setattr(
+        model, "forward", lambda ray_bundle: (rendered.append(len(ray_bundle)), original(ray_bundle))[1]
+    )
+    monkeypatch.setattr(model.config, "eval_num_rays_per_chunk", 100)
+    views, told = shifted_views(dataset.scene.path.parent, dataset), []
     found = ViewEvaluator(pipeline, lambda: told.append(1)).shifted(views)
     assert len(told) == 2 and max(rendered) <= 100
     assert sum(rendered) == 2 * int(dataset.mask(0).sum()) < 2 * dataset.mask(0).size
@@ -166,14 +167,12 @@ def test_shifted_views_have_the_figures_of_the_whole_picture(tmp_path):
     assert found == pytest.approx(expected, rel=1e-5) and found["shifted_0m_truth_pixels"] > 100
 
 
-def test_training_views_are_evaluated_by_the_beams_that_were_held_out(tmp_path, monkeypatch):
+def test_training_views_are_evaluated_by_the_beams_that_were_held_out(pipeline, tmp_path, monkeypatch):
+    assert evaluate_beams(pipeline) == {}
     scene = write_scene(tmp_path)
-    meta = read_json(scene / "transforms.json")
-    plain = pipeline_of(scene)
-    assert evaluate_beams(plain) == {}
-    for frame in meta["frames"]:
-        frame["beams_file_path"] = frame["truth_distance_file_path"]
-    write_json(scene / "transforms.json", meta)
+    with transforms(scene) as meta:
+        for frame in meta["frames"]:
+            frame["beams_file_path"] = frame["truth_distance_file_path"]
     pipeline = pipeline_of(scene)
     found = evaluate_beams(pipeline, most=200)
     count = len(pipeline.datamanager.train_dataset)
