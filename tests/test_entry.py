@@ -41,10 +41,14 @@ def end_of(monkeypatch, capsys, *arguments: str, error: BaseException | None = N
     return ended.value.code, capsys.readouterr().err
 
 
-def test_version(monkeypatch, capsys):
+def test_version_and_help(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["edge-depth-nerf", "--version"])
     entry.main()
     assert capsys.readouterr().out == f"edge-depth-nerf {__version__}\n"
+    monkeypatch.setattr(sys, "argv", ["edge-depth-nerf", "--help"])
+    with pytest.raises(SystemExit):
+        entry.main()
+    assert "--debug" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -60,8 +64,7 @@ def test_version(monkeypatch, capsys):
 )
 def test_a_name_with_a_slip(monkeypatch, capsys, words, said):
     status, stderr = end_of(monkeypatch, capsys, *words)
-    assert status == 2
-    assert stderr.startswith(f"edge-depth-nerf: {said}")
+    assert status == 2 and stderr.startswith(f"edge-depth-nerf: {said}")
 
 
 def test_a_wrong_option_is_answered_by_its_own_command(capsys):
@@ -70,30 +73,23 @@ def test_a_wrong_option_is_answered_by_its_own_command(capsys):
     with pytest.raises(SystemExit):
         cli.parse(["camera-path", "--fram", "30"])
     said = capsys.readouterr().err
-    assert "--fram" in said and "edge-depth-nerf camera-path --help" in said
-    assert "synthesize" not in said and "demo" not in said
+    assert "--fram" in said and "edge-depth-nerf camera-path --help" in said and "synthesize" not in said
     with pytest.raises(SystemExit):
         cli.parse(["process", "rig", "--root", "r", "--output", "o", "--holdout-evry", "3"])
     said = capsys.readouterr().err
     assert "--holdout-every" in said and "kitti360" not in said
 
 
-def test_a_bug_is_one_paragraph_that_asks_to_be_reported(monkeypatch, capsys):
+def test_a_bug_is_one_paragraph_that_asks_to_be_reported_and_names_the_line(monkeypatch, capsys, tmp_path):
     status, said = end_of(monkeypatch, capsys, "doctor", error=KeyError("not\nthere"))
     assert status == 1
     assert said.count("\n") == 1 and said.startswith(f"edge-depth-nerf: a bug in version {__version__}: KeyError: ")
     assert "--debug" in said and "report" in said and "edge-depth-nerf doctor" in said
     assert "Traceback" not in said
-
-
-def test_a_bug_names_the_line_of_ours(monkeypatch, capsys, tmp_path):
-    try:
+    with pytest.raises(TypeError) as error:
         files.write_json(tmp_path / "x.json", object())
-    except TypeError as error:
-        status, said = end_of(monkeypatch, capsys, "doctor", error=error)
-        assert status == 1 and "in files.py, line " in said and "TypeError" in said
-    else:
-        pytest.fail("written")
+    status, said = end_of(monkeypatch, capsys, "doctor", error=error.value)
+    assert status == 1 and "in files.py, line " in said and "TypeError" in said
 
 
 @pytest.mark.parametrize(
@@ -103,23 +99,15 @@ def test_what_the_user_can_mend_is_said_alone(monkeypatch, capsys, error):
     assert end_of(monkeypatch, capsys, "doctor", error=error) == (2, f"edge-depth-nerf: {error}\n")
 
 
-@pytest.mark.parametrize("place", [0, 1, 2])
-def test_debug_gives_the_traceback_wherever_it_stands(monkeypatch, capsys, tmp_path, place):
+def test_debug_gives_the_traceback_wherever_it_stands(monkeypatch, capsys, tmp_path):
     arguments = ["inspect", str(tmp_path / "nowhere")]
     status, plain = end_of(monkeypatch, capsys, *arguments)
     assert status == 2 and "Traceback" not in plain and "transforms.json: no such file" in plain
-    arguments.insert(place, "--debug")
-    status, said = end_of(monkeypatch, capsys, *arguments)
-    assert status == 2 and said.startswith("Traceback") and said.endswith(plain)
-    assert "in read_scene" in said
-    assert os.environ[entry.DEBUG_VARIABLE] == "1"  # for what the command starts
-
-
-def test_debug_is_told_of(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["edge-depth-nerf", "--help"])
-    with pytest.raises(SystemExit):
-        entry.main()
-    assert "--debug" in capsys.readouterr().out
+    for place in (0, 1, 2):
+        monkeypatch.setenv(entry.DEBUG_VARIABLE, "")
+        status, said = end_of(monkeypatch, capsys, *arguments[:place], "--debug", *arguments[place:])
+        assert status == 2 and said.startswith("Traceback") and said.endswith(plain) and "in read_scene" in said
+        assert os.environ[entry.DEBUG_VARIABLE] == "1"  # for what the command starts
 
 
 def command(run: str, before: str = "") -> str:
@@ -147,11 +135,11 @@ def interrupted(code: str, until_s: float, *more_s: float, folder: Path | None =
 SYNTHESIS = """
 import sys
 from edge_depth_nerf.entry import main
-WORDS = ["edge-depth-nerf", "synthesize", "--output", "drive", "--size", "64", "--frames"]
+WORDS = ["edge-depth-nerf", "synthesize", "--scene", "parking", "--output", "drive", "--size", "64", "--frames"]
 """
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.1, 1.5])
+@pytest.mark.parametrize("seconds", [0.0, 1.5])
 def test_ctrl_c_while_it_starts(tmp_path, seconds):
     """While options are read and libraries are imported."""
     code = """
@@ -166,8 +154,15 @@ main()
     assert (done.returncode, done.stderr) == (130, STOPPED)
 
 
-@pytest.mark.parametrize("ending", ["raise ImportError('Please report an issue.') from None", "pass"])
-@pytest.mark.parametrize(("import_s", "more_s"), [(1.0, ()), (60.0, (0.3,)), (60.0, (0.2, 0.2))])
+@pytest.mark.parametrize(
+    ("ending", "import_s", "more_s"),
+    [
+        ("raise ImportError('Please report an issue.') from None", 0.6, ()),
+        ("pass", 0.6, ()),
+        ("raise ImportError('Please report an issue.') from None", 60.0, (0.3,)),
+        ("pass", 60.0, (0.2, 0.2)),
+    ],
+)
 def test_ctrl_c_waits_for_the_end_of_an_import(tmp_path, ending, import_s, more_s):
     """Modules turn it into errors of their own, or swallow it. Whoever presses it twice does not wait."""
     lines = ["try:", f"    print('go', flush=True), time.sleep({import_s})", "except BaseException:", f"    {ending}"]
@@ -187,7 +182,7 @@ import time
 def work():
     try:
         print("go", flush=True)
-        time.sleep(1)
+        time.sleep(0.6)
     except BaseException:
         pass
     print("worked", flush=True)
@@ -195,14 +190,6 @@ def work():
     code = command("def run(_):\n    trimesh.work()\n    time.sleep(60)", "sys.path.insert(0, '')\nimport trimesh")
     done = interrupted(code, 0.2, folder=tmp_path)
     assert (done.returncode, done.stderr, done.stdout) == (130, STOPPED, "worked\n")
-
-
-def test_ctrl_c_ends_work_at_once():
-    code = 'def run(_):\n    print("go", flush=True)\n    while True:\n        time.sleep(0.01)'
-    started = time.monotonic()
-    done = interrupted(command(code), 0.1)
-    assert (done.returncode, done.stderr) == (130, STOPPED)
-    assert time.monotonic() - started < 20
 
 
 @pytest.mark.slow
@@ -232,14 +219,16 @@ def test_ctrl_c_again_and_again_while_threads_finish():
 import torch  # takes its time, in which the first Ctrl-C would meet no threads
 from rich.console import Console
 from edge_depth_nerf.base.console import run_jobs
+def job():
+    print("begun", flush=True)
+    time.sleep(0.9)
 def run(_):
     print("go", flush=True)
-    run_jobs([lambda: time.sleep(1.5)] * 20, "working", Console(quiet=True))
+    run_jobs([job] * 200, "working", Console(quiet=True))
 """
-    started = time.monotonic()
-    done = interrupted(command(code), 0.3, 0.3, 0.3)
+    done = interrupted(command(code), 0.2, 0.2, 0.2)
     assert (done.returncode, done.stderr) == (130, STOPPED)
-    assert time.monotonic() - started < 20  # what had not begun was not begun
+    assert 0 < done.stdout.count("begun") < 100
 
 
 @pytest.fixture
@@ -252,7 +241,10 @@ def hook(monkeypatch):
 
     monkeypatch.setattr(sys, "excepthook", before)
     plain_errors.say_errors_plainly()
-    assert sys.excepthook is not before
+    first = sys.excepthook
+    assert first is not before
+    plain_errors.say_errors_plainly()
+    assert sys.excepthook is first
     return passed
 
 
@@ -285,11 +277,8 @@ def test_nerfstudio_says_our_errors_plainly(hook, capsys, monkeypatch, tmp_path)
 
 
 def test_errors_of_others_stay_theirs(hook, capsys, tmp_path):
-    for call, argument in (
-        (fail, ValueError("theirs")),
-        (fail, FileNotFoundError("theirs")),
-        (open, tmp_path / "none"),
-    ):
+    theirs = (fail, ValueError("theirs")), (fail, FileNotFoundError("theirs")), (open, tmp_path / "none")
+    for call, argument in theirs:
         sys.excepthook(*raised(call, argument))
     # the system's words, wherever they were met
     sys.excepthook(*raised(files.read_json, tmp_path / "none.json"))
@@ -306,25 +295,20 @@ def test_whoever_reads_the_output_may_go(tmp_path):
     assert process.returncode == entry.PIPE_STATUS
 
 
-def test_the_hook_is_put_in_once(hook):
-    first = sys.excepthook
-    plain_errors.say_errors_plainly()
-    assert sys.excepthook is first
-
-
 @pytest.mark.slow
-def test_ns_train_on_what_is_no_scene(tmp_path):
-    call = [Path(sys.executable).with_name("ns-train"), "edge-depth-nerf-lite", "--data", tmp_path / "nowhere"]
-    call += ["--vis", "tensorboard", "--output-dir", tmp_path / "runs"]
-    done = subprocess.run(call, capture_output=True, text=True, check=False, timeout=TIMEOUT_S)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    assert done.stderr.splitlines()[-1].startswith(
-        f"edge-depth-nerf: {tmp_path}/nowhere/transforms.json: no such file."
-    )
+def test_ns_train_on_what_is_no_scene(capfd, monkeypatch, tmp_path, unchecked_types):
+    from nerfstudio.scripts.train import entrypoint
+
+    words = ["edge-depth-nerf-lite", "--data", tmp_path / "nowhere", "--vis", "tensorboard"]
+    monkeypatch.setattr(sys, "argv", ["ns-train", *map(str, [*words, "--output-dir", tmp_path / "runs"])])
+    monkeypatch.setattr(sys, "excepthook", lambda *_: pytest.fail("ns-train has not put in the hook"))
+    error = raised(entrypoint)
+    sys.excepthook(*error)
+    out, err = capfd.readouterr()
+    assert err.splitlines()[-1].startswith(f"edge-depth-nerf: {tmp_path}/nowhere/transforms.json: no such file.")
     # the settings that were changed, not all two hundred
-    assert "edge-depth-nerf-lite: 2000 steps on cpu, scene" in done.stdout and "--vis tensorboard" in done.stdout
-    assert "FusedAdamConfig" not in done.stdout and len(done.stdout.splitlines()) < 10
+    assert "edge-depth-nerf-lite: 2000 steps on cpu, scene" in out and "--vis tensorboard" in out
+    assert "FusedAdamConfig" not in out and len(out.splitlines()) < 10
     assert not (tmp_path / "runs").exists(), "no run was begun"
 
 
