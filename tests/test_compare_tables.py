@@ -2,6 +2,7 @@
 
 import re
 import statistics
+from typing import Any
 
 import numpy as np
 import pytest
@@ -266,7 +267,7 @@ def test_runs_that_differ_in_unnamed_fields_are_refused(results):
 
 
 def test_edges_on_the_path_beside_it_and_from_a_held_out_camera():
-    more = {"truth_edge_recall": 0.8, "truth_depth_edge_recall": 0.7, "shifted_1m_edge_recall": 0.6}
+    more: dict[str, Any] = {"truth_edge_recall": 0.8, "truth_depth_edge_recall": 0.7, "shifted_1m_edge_recall": 0.6}
     more |= {"shifted_0.5m_edge_recall": 0.75, "shifted_0.5m_truth_depth_edge_recall": 0.5}
     more |= {"shifted_0.5m_masked_psnr": 19, "shifted_3m_edge_recall": 0.25}
     more |= {"camera_truth_affine_masked_psnr": 18.5, "camera_truth_edge_recall": 0.45}
