@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from models import build, bundle, layers
@@ -15,6 +16,7 @@ from edge_depth_nerf.kernels import rendering_numba
 from edge_depth_nerf.kernels.rendering import Background, Networks, Rendered
 from edge_depth_nerf.kernels.rendering_numba import STEEPEST, render
 from edge_depth_nerf.plugin.fused.fields import FusedNerfactoField
+from edge_depth_nerf.plugin.scanning import Caster, SceneToModel
 
 
 @pytest.fixture(autouse=True)
