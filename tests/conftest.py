@@ -105,7 +105,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=slow)
         items[:] = [item for item in items if item not in slow]
     files = {item.path for item in slow}
-    items.sort(key=lambda item: item.path not in files)
+    # one worker compiles what trains while the other does not need it yet
+    items.sort(key=lambda item: (item.path.name != "test_commands.py", item.path not in files))
 
 
 @pytest.fixture

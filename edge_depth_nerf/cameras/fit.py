@@ -24,7 +24,7 @@ from edge_depth_nerf.cameras.models import Camera, KannalaBrandt, Pinhole
 
 _FIT_GRID = 150
 """Rays along each side of the grid that is fitted; more change nothing within 1e-3 px."""
-_CHECK_GRID = 401
+_CHECK_GRID = 201
 """Rays along each side of the grid over which the residual is reported; odd against the other."""
 _HOST_STEPS = 10
 """Newton steps of nerfstudio's radial_and_tangential_undistort."""
