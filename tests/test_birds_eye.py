@@ -98,6 +98,8 @@ def of_the_yard(scene) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(birds_eye, "load_model", lambda *_: None)
         patch.setattr(birds_eye, "Caster", lambda _, place: Caster(YardModel(place, offset_m), place))
+        # the yard has no networks: lengths are its outputs, too
+        patch.setattr(Caster, "_lengths", lambda caster, rays: caster._model.get_outputs_for_camera_ray_bundle(rays))
         yield
 
 

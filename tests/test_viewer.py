@@ -34,6 +34,7 @@ from edge_depth_nerf.plugin.viewer import AZIMUTHS, RINGS, DriveLayers, lens_cap
 
 pytestmark = pytest.mark.slow
 
+METHOD = "edge-depth-nerf-lite"
 TIMEOUT_S = 120
 
 
@@ -50,10 +51,6 @@ def test_the_rim_of_an_equidistant_lens():
     expected = np.minimum(np.minimum(np.abs(across), np.abs(along)), limit)
     assert {True, False} == set((expected == limit).tolist())
     assert np.abs(rim_rad(camera, limit) - expected).max() <= 1.01 * limit / 720
-    # a lens that sees behind itself has a cap beyond the half sphere
-    camera = KannalaBrandt(200, 200, 50.0, 50.0, 100.0, 100.0, 0.0, 0.0, 0.0, 0.0)
-    assert np.degrees(rim_rad(camera, math.radians(110))) == pytest.approx(110, abs=0.2)
-    assert lens_cap(camera, math.radians(110))[0][:, 2].min() == pytest.approx(math.cos(math.radians(110)), abs=0.01)
 
 
 @pytest.mark.parametrize("camera", [fisheye(), pinhole()], ids=["fisheye", "pinhole"])
@@ -70,6 +67,12 @@ def test_a_cap_is_the_picture_on_the_sphere(camera):
     area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2
     exact = (1 - np.cos(rim_rad(camera, math.radians(100)))).mean() * 2 * np.pi
     assert area == pytest.approx(exact, rel=0.02)
+
+
+def test_a_lens_that_sees_behind_itself_has_a_cap_beyond_the_half_sphere():
+    camera = KannalaBrandt(200, 200, 50.0, 50.0, 100.0, 100.0, 0.0, 0.0, 0.0, 0.0)
+    assert np.degrees(rim_rad(camera, math.radians(110))) == pytest.approx(110, abs=0.2)
+    assert lens_cap(camera, math.radians(110))[0][:, 2].min() == pytest.approx(math.cos(math.radians(110)), abs=0.01)
 
 
 def test_names_with_numbers_are_in_order():
@@ -108,28 +111,36 @@ def test_distance_and_its_uncertainty_are_metres(pipeline):
     assert not [name for name in outputs if "distance" in name and "depth" in name]
 
 
-def test_uncertainty_is_of_the_weights_that_colour_the_ray(pipeline, monkeypatch):
+def test_uncertainty_is_of_the_weights_that_colour_the_ray(pipeline):
     """Taken apart again: the field's own weights, and the spread of many ends drawn by them."""
-    model, kept = pipeline.model.eval(), {}
+    model = pipeline.model.eval()
     rays = view_of(pipeline).generate_rays(camera_indices=0)[10, 10:12]
+    kept = {}
+    original = model.field.render
 
-    def keep(part: object, method: str) -> None:
-        original = getattr(part, method)
+    def rendered(*args, **kwargs):
+        kept["rendered"] = original(*args, **kwargs)
+        return kept["rendered"]
 
-        def kept_too(*args, **kwargs):
-            kept[method] = original(*args, **kwargs)
-            return kept[method]
+    model.field.render = rendered
+    samples = {}
+    sampler = model.proposal_sampler.forward
 
-        monkeypatch.setattr(part, method, kept_too)
+    def sampled(*args, **kwargs):
+        result = sampler(*args, **kwargs)
+        samples["final"] = result[0]
+        return result
 
-    keep(model.field, "render")
-    keep(model.proposal_sampler, "forward")
-    with torch.no_grad():
-        outputs = model(rays)
+    model.proposal_sampler.forward = sampled
+    try:
+        with torch.no_grad():
+            outputs = model(rays)
+    finally:
+        model.field.render, model.proposal_sampler.forward = original, sampler
     rng = np.random.default_rng(0)
-    frustums = kept["forward"][0].frustums
+    frustums = samples["final"].frustums
     for ray in range(2):
-        weights = kept["render"].weights[ray].double().numpy()
+        weights = kept["rendered"].weights[ray].double().numpy()
         starts, ends = frustums.starts[ray, :, 0].numpy(), frustums.ends[ray, :, 0].numpy()
         chosen = rng.choice(len(weights), 200_000, p=weights / weights.sum())
         drawn = starts[chosen] + (ends - starts)[chosen] * rng.random(200_000)
@@ -137,18 +148,18 @@ def test_uncertainty_is_of_the_weights_that_colour_the_ray(pipeline, monkeypatch
         assert float(outputs["distance_uncertainty"][ray]) == pytest.approx(expected_m, rel=0.02)
 
 
+@pytest.mark.parametrize("kind", [CameraType.FISHEYE, CameraType.EQUIRECTANGULAR, CameraType.PERSPECTIVE])
 @pytest.mark.parametrize("implementation", ["fused", "torch"])
-def test_previews_of_any_size_are_whole(scene, implementation):
+def test_previews_of_any_size_are_whole(scene, kind, implementation):
     """An odd fisheye picture has its principal point on a pixel's centre, where nerfstudio's ray is 0/0."""
     pipeline = pipeline_of(scene, "test", implementation=implementation)
     pipeline.eval()
     pose = view_of(pipeline).camera_to_worlds[0]
-    for kind in (CameraType.FISHEYE, CameraType.EQUIRECTANGULAR, CameraType.PERSPECTIVE):
-        camera = get_camera(CameraState(fov=1.5, aspect=1.0, c2w=pose, camera_type=kind), 9, 9)
-        assert bool(camera.generate_rays(camera_indices=0).directions.isnan().any()) == (kind is CameraType.FISHEYE)
-        outputs = pipeline.model.get_outputs_for_camera(camera)
-        assert all(torch.isfinite(value).all() for value in outputs.values()), kind
-        assert float(camera.cx) == 4.5  # the caller's camera is left as it was
+    camera = get_camera(CameraState(fov=1.5, aspect=1.0, c2w=pose, camera_type=kind), 9, 9)
+    assert bool(camera.generate_rays(camera_indices=0).directions.isnan().any()) == (kind is CameraType.FISHEYE)
+    outputs = pipeline.model.get_outputs_for_camera(camera)
+    assert all(torch.isfinite(value).all() for value in outputs.values())
+    assert float(camera.cx) == 4.5  # the caller's camera is left as it was
 
 
 # ---- layers ----------------------------------------------------------------------------------------------------------
@@ -158,7 +169,7 @@ def in_scene_m(pipeline, points: np.ndarray) -> np.ndarray:
     return (points / outputs.dataparser_scale - transform[:, 3]) @ transform[:, :3]
 
 
-def test_clouds_lie_where_the_wall_is_and_have_its_colours(pipeline):
+def test_clouds_lie_where_the_wall_is(pipeline):
     """The scene is a ball with a wall; cameras stand and look in many ways."""
     layers = pipeline.drive.layers
     lidar, prior = layers._lidar(), layers._prior()
@@ -173,20 +184,26 @@ def test_clouds_lie_where_the_wall_is_and_have_its_colours(pipeline):
     assert np.abs(lidar.rgb - expected).mean() < 6
     assert np.allclose(lidar.height_m - lidar.height_m[0], wall[:, 2] - wall[0, 2], atol=1e-3)
     assert lidar.sigma_m is None and prior.sigma_m is not None and prior.sigma_m.min() > 0
-    # how they are coloured
-    assert np.array_equal(prior.colours("picture"), prior.rgb)
-    surest, least_sure = prior.sigma_m.argmin(), prior.sigma_m.argmax()
-    by_sigma, by_height = prior.colours("sigma").astype(int), prior.colours("height").astype(int)
-    assert by_sigma[least_sure].sum() > by_sigma[surest].sum()
-    assert (by_sigma[surest] == SIGMA.colours[0]).all() or prior.sigma_m.min() > SIGMA.low
-    lowest, highest = by_height[prior.height_m.argmin()], by_height[prior.height_m.argmax()]
+
+
+def test_colours_of_clouds(pipeline):
+    cloud = pipeline.drive.layers._prior()
+    assert cloud.sigma_m is not None
+    assert np.array_equal(cloud.colours("picture"), cloud.rgb)
+    by_sigma = cloud.colours("sigma").astype(int).sum(1)
+    assert by_sigma[cloud.sigma_m.argmax()] > by_sigma[cloud.sigma_m.argmin()]
+    assert (cloud.colours("sigma")[cloud.sigma_m.argmin()] == SIGMA.colours[0]).all() or cloud.sigma_m.min() > SIGMA.low
+    lowest, highest = (cloud.colours("height")[index].astype(int) for index in
+                       (cloud.height_m.argmin(), cloud.height_m.argmax()))  # fmt: skip
     assert lowest[2] > lowest[0] and highest[0] > highest[2]
+    lidar = pipeline.drive.layers._lidar()
     assert np.array_equal(lidar.colours("sigma"), lidar.colours("height"))
 
 
 def test_nerfstudio_finds_the_layers(pipeline):
-    found = parse_object(pipeline, ViewerControl, "Custom Elements")
-    assert found == [("Custom Elements/drive/layers", pipeline.drive.layers)]
+    assert parse_object(pipeline, ViewerControl, "Custom Elements") == [
+        ("Custom Elements/drive/layers", pipeline.drive.layers)
+    ]
     # they stand in a folder of their own, and not a second time among its elements
     assert not [path for path, _ in parse_object(pipeline, ViewerElement, "Custom Elements") if "/drive/" in path]
     # nothing of it is in a checkpoint
@@ -196,8 +213,15 @@ def test_nerfstudio_finds_the_layers(pipeline):
 def test_what_is_not_there_cannot_be_switched_on(tmp_path):
     pipeline = pipeline_of(write_scene(tmp_path, lidar=False, mono=False), "test", depth_loss="none")
     switches = pipeline.drive.layers.switches
-    disabled = {"lenses": False, "path": False, "lidar": True, "prior": True, "scan": True}
-    assert {name: switch.disabled for name, switch in switches.items()} == disabled
+    assert {name: switch.disabled for name, switch in switches.items()} == {
+        **{"lenses": False, "path": False, "lidar": True, "prior": True, "scan": True}
+    }
+
+
+def test_nothing_is_made_without_a_viewer(scene, monkeypatch):
+    for name in ("_lidar", "_prior", "_scan", "_draw_lenses", "_draw_path"):
+        monkeypatch.setattr(DriveLayers, name, lambda *_: pytest.fail("made"))
+    pipeline_of(scene, "test")
 
 
 # ---- from coarse to fine ---------------------------------------------------------------------------------------------
@@ -228,7 +252,9 @@ def test_a_resting_browser_gets_finer_pictures_in_steps(machine):
 )
 def test_the_steps_take_what_the_machine_can(machine, rays_per_s, heights):
     machine._rays_per_s = rays_per_s
-    sizes = [machine._calculate_image_res(1.5) for machine.state in ("low_move", "low_static", "middle", "high")]
+    sizes = []
+    for machine.state in ("low_move", "low_static", "middle", "high"):
+        sizes.append(machine._calculate_image_res(1.5))
     assert [height for height, _ in sizes] == heights
     assert all(abs(width - 1.5 * height) <= 1.5 and width <= 512 for height, width in sizes)
 
@@ -294,15 +320,14 @@ def test_complete_pictures_alone_have_detail_and_none_during_a_training(machine,
     assert detail.is_shown
 
 
-def test_without_a_viewer_nothing_is_made_and_the_switch_of_detail_is_as_the_training_has_it(scene, monkeypatch):
-    for name in ("_lidar", "_prior", "_scan", "_draw_lenses", "_draw_path"):
-        monkeypatch.setattr(DriveLayers, name, lambda *_: pytest.fail("made"))
+def test_the_switch_of_detail_begins_as_the_training_has_it(scene):
     assert [pipeline_of(scene, "test", detail=on).drive.layers.detail.value for on in (False, True)] == [False, True]
 
 
 def test_a_movement_ends_a_fine_picture_and_no_other(machine):
-    others = [("low_move", True), ("middle", False), ("high", False)]
-    for number, (machine.state, machine._is_rendering) in enumerate(others):
+    for number, (machine.state, machine._is_rendering) in enumerate(
+        [("low_move", True), ("middle", False), ("high", False)]
+    ):
         machine.action(RenderAction("move", reported(number)))
         assert not machine.interrupt_render_flag
     for number, machine.state in enumerate(("low_static", "middle", "high"), start=10):
@@ -399,10 +424,10 @@ def test_where_a_browser_opened_is_not_rendered(machine, monkeypatch):
 # ---- the viewer itself, during a training ---------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def training(tmp_path_factory) -> Iterator[SimpleNamespace]:
-    """A training of the sample drive that goes on while it is looked at."""
+    """A training of the sample drive that goes on while it is looked at; `trainer`, `viewer`, `layers`."""
     folder = tmp_path_factory.mktemp("viewer")
     copy_sample_drive(folder / "scene")
-    config = deepcopy(all_methods["edge-depth-nerf-lite"])
+    config = deepcopy(all_methods[METHOD])
     config.data = config.pipeline.datamanager.data = folder / "scene"
     config.output_dir, config.timestamp, config.experiment_name = folder, "run", "viewer"
     config.max_num_iterations, config.steps_per_save = 100_000, 100_000
@@ -421,22 +446,24 @@ def training(tmp_path_factory) -> Iterator[SimpleNamespace]:
     thread = threading.Thread(target=trainer.train, daemon=True)
     thread.start()
     until(lambda: trainer.step > 5)
-    yield SimpleNamespace(trainer=trainer, viewer=trainer.viewer_state, layers=trainer.pipeline.drive.layers)
+    yield SimpleNamespace(
+        trainer=trainer, viewer=trainer.viewer_state, layers=trainer.pipeline.drive.layers, scene=folder / "scene"
+    )
     trainer.shutdown()
     thread.join(TIMEOUT_S)
     assert not thread.is_alive()
 
 
-def test_pausing_a_training_asks_for_a_picture_with_detail(training, monkeypatch):
-    layers, asked = training.layers, []
+@pytest.mark.parametrize("switched_on", [False, True])
+def test_pausing_a_training_asks_for_a_picture_with_detail(training, monkeypatch, switched_on):
+    layers, asked = training.trainer.pipeline.drive.layers, []
     monkeypatch.setattr(Viewer, "_trigger_rerender", lambda viewer: asked.append(viewer))
+    # the switch itself would ask, too, from a thread of its own
+    monkeypatch.setattr(layers, "detail", SimpleNamespace(value=switched_on))
     ours = [each for each in training.viewer.pause_train._impl.update_cb if each.__module__ == layers.__module__]
     assert len(ours) == 1
-    for switched_on in (False, True):
-        # the switch itself would ask, too, from a thread of its own
-        monkeypatch.setattr(layers, "detail", SimpleNamespace(value=switched_on))
-        ours[0](None)
-        assert asked == ([training.viewer] if switched_on else [])
+    ours[0](None)
+    assert asked == ([training.viewer] if switched_on else [])
 
 
 def seen(training, layer: str) -> bool | None:
@@ -466,12 +493,12 @@ def test_pictures_are_off_at_first_and_the_path_is_on(training):
     assert not nodes(training, "lenses") and handles["/cameras"].visible is False
     training.layers.switches["lenses"].value = True
     until(lambda: bool(seen(training, "lenses")))
-    dataset = training.trainer.pipeline.datamanager.train_dataset
-    assert len(nodes(training, "lenses")) == len(dataset) == 22
+    count = len(training.trainer.pipeline.datamanager.train_dataset)
+    assert len(nodes(training, "lenses")) == count == 22
     assert {name.rpartition("/")[2] for name in nodes(training, "path")} == {"image_02", "image_03"}
     # nerfstudio's pyramids give way
     assert handles["/cameras"].visible is False
-    poses = dataset.cameras.camera_to_worlds
+    poses = training.trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds
     for index in (0, 13):
         ours, theirs = handles[f"/drive/lenses/{index:05d}"], training.viewer.camera_handles[index]
         assert np.allclose(ours.position, poses[index, :, 3] * VISER_NERFSTUDIO_SCALE_RATIO, atol=1e-5)
@@ -529,30 +556,29 @@ def interruptible() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
-def wait_in(page, happened: Callable[[], Any]) -> None:
-    """Wait for something while the page goes on."""
-    until(happened, wait=lambda seconds: page.wait_for_timeout(1000 * seconds))
-
-
 @pytest.fixture(scope="module")
 def page(browser, training, interruptible):
     """The viewer in a browser without a network, looking at the drive from above; the training waits."""
     server = training.viewer.viser_server
-    training.viewer.control_panel._max_res.value = 128
-    training.trainer.training_state = "paused"
     here = f"http://127.0.0.1:{server.get_port()}"
     page = browser.new_page(viewport={"width": 900, "height": 620})
     page.route("**", lambda route: route.continue_() if route.request.url.startswith(here) else route.abort())
     page.goto(here)
     page.wait_for_selector("text=Output type", timeout=TIMEOUT_S * 1000)
-    wait_in(page, server.get_clients)
-    places = training.trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :, 3].numpy()
-    centre = places.mean(0) * VISER_NERFSTUDIO_SCALE_RATIO
-    for client in server.get_clients().values():
-        client.camera.position = tuple(centre + np.array([-4.0, -3.0, 4.0]))
-        client.camera.look_at = tuple(centre)
+    training.viewer.control_panel._max_res.value = 128
+    training.trainer.training_state = "paused"
+    until(lambda: bool(server.get_clients()), wait=lambda seconds: page.wait_for_timeout(1000 * seconds))
+    look_from_above(training)
     yield page
     training.trainer.training_state = "training"
+
+
+def look_from_above(training) -> None:
+    places = training.trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :, 3].numpy()
+    centre = places.mean(0) * VISER_NERFSTUDIO_SCALE_RATIO
+    for client in training.viewer.viser_server.get_clients().values():
+        client.camera.position = tuple(centre + np.array([-4.0, -3.0, 4.0]))
+        client.camera.look_at = tuple(centre)
 
 
 def canvas(page) -> np.ndarray:
@@ -578,6 +604,7 @@ def changed(one: np.ndarray, other: np.ndarray) -> int:
     return int((np.abs(one - other).max(-1) > 40).sum())
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_scene(page, training):
     picture = settled(page)
     assert picture.std(axis=(0, 1)).max() > 5  # not blank
@@ -586,12 +613,13 @@ def test_the_page_shows_the_scene(page, training):
     until(lambda: "distance_coloured" in training.viewer.control_panel._output_render.options)
 
 
+@pytest.mark.slow
 def test_a_browser_begins_at_a_training_camera(browser, page, training):
     server = training.viewer.viser_server
     known = set(server.get_clients())
     other = browser.new_page(viewport={"width": 500, "height": 400})
     other.goto(f"http://127.0.0.1:{server.get_port()}")
-    wait_in(other, lambda: set(server.get_clients()) - known)
+    until(lambda: bool(set(server.get_clients()) - known), wait=lambda seconds: other.wait_for_timeout(1000 * seconds))
     (number,) = set(server.get_clients()) - known
     dataset = training.trainer.pipeline.datamanager.train_dataset
     pose = dataset.cameras.camera_to_worlds[5].double().numpy()  # of eleven of the first camera
@@ -607,26 +635,29 @@ def test_a_browser_begins_at_a_training_camera(browser, page, training):
     other.close()
 
 
-def test_switches_work(page, training):
-    labels = {"lidar": "LiDAR points", "prior": "Depth prior", "path": "Path", "lenses": "Lenses"}
-    begun = {layer: bool(training.layers.switches[layer].value) for layer in labels}
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("label", "layer"), [("LiDAR points", "lidar"), ("Depth prior", "prior"), ("Path", "path"), ("Lenses", "lenses")]
+)
+def test_switches_work(page, training, label, layer):
+    box = page.get_by_label(label)
+    begun = bool(training.layers.switches[layer].value)
+    before = settled(page)
 
-    def turn(layer: str, shown: bool) -> None:
-        page.get_by_label(labels[layer]).click()
-        wait_in(page, lambda: training.layers.switches[layer].value is shown and seen(training, layer) is shown)
+    def turn(shown: bool, shows: Callable[[np.ndarray], bool]) -> np.ndarray:
+        box.click()
+        until(
+            lambda: training.layers.switches[layer].value is shown and seen(training, layer) is shown,
+            wait=lambda seconds: page.wait_for_timeout(1000 * seconds),
+        )
         page.mouse.move(300, 300)
+        return settled(page, shows)
 
-    pictures = [settled(page)]
-    for layer in ("path", "lenses", "lidar"):
-        turn(layer, not begun[layer])
-        pictures.append(settled(page, lambda picture: changed(pictures[-1], picture) > 150))
-    turn("prior", True)  # which lies where the LiDAR's points do
-    for layer in labels:
-        turn(layer, begun[layer])
-    least = min(changed(pictures[0], each) for each in pictures[1:])
-    settled(page, lambda picture: changed(pictures[0], picture) < least / 3)
+    other = turn(not begun, lambda picture: changed(before, picture) > 150)
+    turn(begun, lambda picture: changed(before, picture) < changed(before, other) / 3)
 
 
+@pytest.mark.slow
 def test_outputs_and_the_fisheye_preview(page, training):
     def saturation(picture: np.ndarray) -> float:
         return float((picture.max(-1) - picture.min(-1)).mean())
@@ -644,6 +675,11 @@ def test_outputs_and_the_fisheye_preview(page, training):
         page.get_by_text("Add Keyframe").click()
         page.wait_for_timeout(1000)
     page.get_by_text("Preview Render").click()
-    state = training.viewer.render_tab_state
-    wait_in(page, lambda: state.preview_render and state.preview_camera_type == "Fisheye")
+    until(
+        lambda: (
+            training.viewer.render_tab_state.preview_render
+            and training.viewer.render_tab_state.preview_camera_type == "Fisheye"
+        ),
+        wait=lambda seconds: page.wait_for_timeout(1000 * seconds),
+    )
     settled(page, lambda picture: picture[150:400].std() > 5 and changed(plain, picture) > 5000)
