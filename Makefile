@@ -98,7 +98,7 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python docs/check_prose.py
-	$(BIN)/pyright
+	$(BIN)/pyright --threads 2
 
 format: setup
 	$(BIN)/ruff check --fix .
