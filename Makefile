@@ -11,7 +11,7 @@ help:
 	@echo "make real        all methods on real drives, with three seeds (REAL='their folders'; some hours)"
 	@echo "make gpu         what a GPU makes of it: start, steps, kernels, trainings, tests (outputs/gpu/report.md; eight minutes)"
 	@echo "make test-fast   tests of what needs no nerfstudio and a smoke run of the plugin, in a minute and a half"
-	@echo "make test        run all tests, in a quarter of an hour"
+	@echo "make test        run all tests, in 25 minutes"
 	@echo "make test-pure   tests of the modules that need no nerfstudio, under NumPy 2"
 	@echo "make coverage    all tests, and which lines and branches they run"
 	@echo "make fuzz        a thousand spoilt files for every reader, then a coverage-guided fuzzer (half an hour)"
