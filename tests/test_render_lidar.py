@@ -399,13 +399,18 @@ def test_a_film_shows_each_scan(trained):
     assert (seen & expected[:, ::-1]).sum() < 0.4 * expected.sum()
 
 
-@pytest.mark.parametrize("form", ["ply", "bin"])
+@pytest.mark.parametrize("form", ["ply", "pcd", "bin"])
 def test_a_film_has_an_empty_picture_where_no_ray_came_back(trained, monkeypatch, form):
     monkeypatch.setattr(RayDrop, "kept", lambda _, cast, reach_m: np.zeros(cast.hit.shape, bool))
     output = render_lidar(RenderLidarOptions(trained, every=9, film=True, form=form), QUIET)
     with Image.open(output / "scans.webp") as film:
         assert np.abs(np.asarray(film.convert("RGB")).astype(int) - NO_VALUE_RGB).max() < 4
     assert read_json(output / "figures.json")["sweeps"]["median_m"] < 2e-3
+    # a broken scan is no empty one
+    broken = next(output.glob(f"*.{form}"))
+    broken.write_bytes(b"broken")
+    with pytest.raises(InputError, match=broken.name):
+        render_lidar(RenderLidarOptions(trained, every=9, film=True, form=form), QUIET)
 
 
 def test_points_are_drawn_from_behind_and_above():

@@ -18,7 +18,7 @@ from edge_depth_nerf.cameras.transforms import rigid
 from edge_depth_nerf.films.intensities import Intensities
 from edge_depth_nerf.films.paths import CameraPath, lane_shift
 from edge_depth_nerf.films.placed import outside, placed
-from edge_depth_nerf.films.scan_files import Scan, write_scan
+from edge_depth_nerf.films.scan_files import Scan, read_points, write_scan
 from edge_depth_nerf.films.scan_film import ScanFilm
 from edge_depth_nerf.films.scan_options import RenderLidarOptions
 from edge_depth_nerf.films.scanning import RayDrop, evaluate, learn_ray_drop, load_model, recorded_pattern, scan
@@ -209,11 +209,7 @@ def _film(output: Path, options: RenderLidarOptions, times_s: Float64[np.ndarray
     film = ScanFilm(float(np.median(np.diff(times_s[:: options.every]))) if len(times_s) > options.every else 0.1)
     with progress_bars(console, counted=True) as progress:
         for number in progress.track(range(0, len(times_s), options.every), description="Drawing the film"):
-            try:
-                points_m = read_scan(output / f"{number:010d}.{options.form}", ScanFormat()).points_m.numpy()
-            except InputError:  # no ray came back: a scan without points, which no drive has
-                points_m = np.zeros((0, 3), np.float32)
-            film.add(points_m)
+            film.add(read_points(output / f"{number:010d}.{options.form}"))
     film.write(output / FILM)
     say(console, f"  {output / FILM}")
 

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int16
+from jaxtyping import Float, Float32, Int16
 from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.files import write_bytes
 from edge_depth_nerf.lidar.ply import ply_bytes
+from edge_depth_nerf.lidar.scans import ScanFormat, read_scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,3 +72,15 @@ _WRITERS: dict[str, Callable[[Scan], bytes]] = {
 def write_scan(path: Path, scan: Scan) -> None:
     """Write a scan in the format of the file's suffix, atomically."""
     write_bytes(path, _WRITERS[path.suffix[1:]](scan))
+
+
+def read_points(path: Path) -> Float[np.ndarray, "points 3"]:
+    """Read the points of a scan that `write_scan` wrote; one of no points, which no drive has, is no error.
+
+    Raises:
+        InputError: the file is broken.
+    """
+    none = Scan(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int16))
+    if path.read_bytes() == _WRITERS[path.suffix[1:]](none):
+        return none.points_m
+    return read_scan(path, ScanFormat()).points_m.numpy()

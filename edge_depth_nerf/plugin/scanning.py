@@ -94,7 +94,7 @@ class Caster:
         """Cast rays from places in the scene (metres) along unit vectors in the scene.
 
         They begin at the model's near plane and end at its far plane; with `reach_m` they begin at their origins, end
-        after so many metres, and meet no sky. Colours take as long as the rest.
+        after so many metres, and meet no sky. Colours take a third more time.
         """
         shape = direction.shape[:-1]
         flat = [each.reshape(1, -1, 3) for each in (origin_m, direction)]
