@@ -364,3 +364,13 @@ def test_views_are_evaluated_with_detail_beside_those_without(tmp_path, monkeypa
     assert len(told) == 2 * (count + 1)
     assert len([*(tmp_path / "views").glob("eval_detail_*.png")]) == count
     assert len([*(tmp_path / "views").glob("eval_img_*.png")]) == count
+
+
+def test_neighbours_show_what_a_grey_view_lacks():
+    lens, pose = fisheye(64, 56), at(0.5)
+    colours, distance, origins, directions, valid = seen(lens, pose)
+    around = [grey_detail(lens, at(x)) for x in (0.2, 0.8)]
+    added = carried(origins, directions, distance.flatten(), around).view(56, 64, 3)
+    inside = valid & (lens.pixel_centres() - torch.tensor([32.0, 28.0])).norm(dim=-1).lt(20)
+    before, after = (GREY - colours)[inside].abs().mean(), (GREY + added - colours)[inside].abs().mean()
+    assert after < 0.1 * before

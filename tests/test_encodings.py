@@ -324,3 +324,11 @@ def test_the_contraction_is_nerfactos():
     assert torch.equal(found[0][0], found[1][0])
     # at the very centre both give NaN, from 0 / 0 in the branch that is not selected
     torch.testing.assert_close(found[1][1], found[0][1], equal_nan=True)
+
+
+def test_a_border_has_no_gradient_across_it():
+    _, fused = both(num_levels=1, log2_hashmap_size=10)
+    x = torch.tensor([[0.5, 0.26, 0.77], [0.26, 0.77, 0.5]], requires_grad=True)  # 16 cells: 0.5 is a border
+    fused(x).sum().backward()
+    assert x.grad is not None
+    assert torch.equal(x.grad == 0, torch.tensor([[True, False, False], [False, False, True]]))

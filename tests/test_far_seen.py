@@ -213,3 +213,11 @@ def test_the_field_is_where_the_points_are(tmp_path):
     expected = np.quantile(np.concatenate(up), [0.001, 0.999])
     assert field_deg(scene, scene.pictures) == pytest.approx(expected, abs=0.05)
     assert field_deg(scene, []) is None
+
+
+@pytest.mark.parametrize("pictures", [0, 1])
+def test_one_picture_or_none_knows_nothing_more(tmp_path, pictures):
+    scene = write_drive(tmp_path)
+    cloud = static_cloud(scene, scene.pictures[:pictures])
+    found = seen_above(cloud, scene, scene.pictures[0], (LENS.width, LENS.height))
+    assert (found > 0).mean() < 0.005

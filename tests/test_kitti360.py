@@ -57,7 +57,14 @@ from edge_depth_nerf.mono.calibration import calibrate_scene
 from edge_depth_nerf.process import build
 from edge_depth_nerf.process.colmap import poses as colmap_poses
 from edge_depth_nerf.process.converters import convert
-from edge_depth_nerf.process.kitti360.calibration import read_cam_to_pose, read_cam_to_velo, read_mei_camera, read_rig
+from edge_depth_nerf.process.kitti360.calibration import (
+    read_cam_to_pose,
+    read_cam_to_velo,
+    read_mei_camera,
+    read_poses,
+    read_rig,
+    read_timestamps,
+)
 from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.scene.reader import read_scene
@@ -726,3 +733,43 @@ def test_report_says_how_well_the_cameras_fit(drive: RoomDrive, tmp_path: Path) 
     assert text.count("No frame is held out") == 1
     assert json.loads((tmp_path / "scene/process.json").read_text())["kind"] == "kitti360"
     assert replace(report, notices=()).scene == tmp_path / "scene"
+
+
+def test_cloud_has_nothing_of_held_out_frames(tmp_path: Path, drive: RoomDrive) -> None:
+    # only the sweep of frame 1, held out of every 2, reaches beyond the room
+    far = drive.points_m[1] * 3
+    write_points(drive.sweep(1), far)
+    process(drive, tmp_path / "scene", holdout_every=2)
+    meta = read_json(tmp_path / "scene/transforms.json")
+    assert {name[-14:-4] for name in meta["val_filenames"]} == {"0000000001"}
+    world = read_ply(tmp_path / "scene/points.ply")[0] + np.array(meta["world_offset_m"])
+    assert (world > ROOM[0] - 0.01).all() and (world < ROOM[1] + 0.01).all()
+    assert maps(tmp_path / "scene", "lidar_file_path")["image_02", 1].max() > 25
+
+
+def test_chain_of_frames(drive: RoomDrive) -> None:
+    rig = read_rig(drive.root / "calibration", CAMERAS)
+    cam0_to_pose, cam0_to_velo = matrix(CAM_TO_POSE["image_00"]), matrix(CAM0_TO_VELO)
+    for name in CAMERAS:
+        # velo → camera 0 → vehicle → camera k
+        chain = np.linalg.inv(matrix(CAM_TO_POSE[name])) @ cam0_to_pose @ np.linalg.inv(cam0_to_velo)
+        found = np.linalg.inv(rig.camera_to_pose[name]) @ rig.velo_to_pose
+        np.testing.assert_allclose(found, chain, atol=1e-12)
+    # the scanner's axes in the vehicle: x forward stays, y left and z up become right and down
+    np.testing.assert_allclose(rig.velo_to_pose[:3, :3], np.diag([1, -1, -1]), atol=0.02)
+
+
+def test_timestamps_keep_fractions_of_a_microsecond(tmp_path: Path) -> None:
+    path = tmp_path / "timestamps.txt"
+    path.write_text("1970-01-02 00:00:01.123456789\n1970-01-02 00:00:02\n\n")
+    first, second = read_timestamps(path)
+    assert first == pytest.approx(86401.123456789, abs=1e-9)
+    assert second == 86402.0
+
+
+def test_poses_skip_frames(tmp_path: Path) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(_pose_line(3) + "\n" + _pose_line(11).replace("11 ", "1.1e1   ", 1))
+    assert {frame: found.tolist() for frame, found in read_poses(path).items()} == {
+        frame: pose(0).tolist() for frame in (3, 11)
+    }

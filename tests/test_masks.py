@@ -456,3 +456,12 @@ def test_a_vehicle_touches_the_lower_rim_broadly_or_a_corner(columns: tuple[int,
     lens, vehicle = np.ones((60, 100), bool), np.zeros((60, 100), bool)
     vehicle[40:, slice(*columns)] = True
     assert ego._at_vehicles_place(vehicle, lens).any() == kept
+
+
+def test_sky_is_found_above_the_horizon() -> None:
+    picture, true = outdoors()
+    found = sky.find_sky(picture, USE, UP, CAMERA, NO_LIDAR)
+    assert not (found & ~true).any()
+    _, y = pixels()
+    # the lowest degree is left out
+    assert found[true & (y < SIZE / 2 - FOCAL_PX * np.tan(np.radians(2.0)))].mean() > 0.97

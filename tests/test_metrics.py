@@ -169,3 +169,16 @@ def test_depth_errors_of_nothing_are_left_out_and_of_wrong_input_refused(uncheck
         DepthErrors().update(torch.where(torch.arange(6).reshape(2, 3) == 4, math.nan, ones), ones, mask)
     with pytest.raises(InputError, match=r"pred_distance_m \(3, 2\), true_distance_m \(2, 3\)"):
         DepthErrors().update(ones.T, ones, mask)
+
+
+def test_depth_errors_are_pooled_over_pixels():
+    rng = np.random.default_rng(0)
+    true = torch.tensor(rng.uniform(0, 70, (20, 30)))
+    pred = true * torch.tensor(rng.uniform(0.7, 1.4, (20, 30)))
+    mask = torch.tensor(rng.random((20, 30)) < 0.7)
+    whole, parts = DepthErrors(), DepthErrors()
+    whole.update(pred, true, mask)
+    for rows in (slice(0, 3), slice(3, 20)):
+        parts.update(pred[rows], true[rows], mask[rows])
+    parts.update(pred, true, torch.zeros_like(mask))
+    assert parts.compute("") == pytest.approx(whole.compute(""))

@@ -462,3 +462,21 @@ def test_levels_that_do_not_learn_are_left_out_and_the_others_pull_as_before(los
         used = levels[-1:] if rests and loss != "urban-nerf" else levels
         found = [object_of(replace(level, final=levels[-1])).sum() / counted for level in used]
         assert float(losses[LOSSES[loss]]) == pytest.approx(float(sum(found)) / 3, rel=1e-5)
+
+
+def test_sigma_of_ds_nerf_is_a_standard_deviation_in_metres():
+    """One sample a ray, one sigma from the prior: it is pulled exp(-1/2) as hard as one at the prior."""
+    pulls = []
+    for midpoint_m in (5.0, 5.3):
+        starts_m, ends_m = (torch.full((1, 1), midpoint_m + half) for half in (-0.05, 0.05))
+        level = Level(torch.full((1, 1), 0.5), starts_m, ends_m, torch.tensor([5.0]), torch.tensor([9.0]))
+        pulls.append(float(DsNerfLoss(sigma_m=0.3)(level)))
+    assert pulls[1] / pulls[0] == pytest.approx(math.exp(-0.5), rel=1e-4)
+
+
+def test_no_download_and_no_lpips_in_the_checkpoint(monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", lambda *_, **__: pytest.fail("downloads"))
+    model = build()
+    assert not [name for name in model.state_dict() if "lpips" in name]
+    assert math.isnan(model.lpips(torch.zeros(1, 3, 8, 8), torch.zeros(1, 3, 8, 8)))

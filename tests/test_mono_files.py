@@ -307,3 +307,9 @@ METRIC_Z = {"maps": Path("m"), "maps_kind": "metric", "maps_along": "z"}
 def test_options_that_do_not_go_together(options, expected):
     with pytest.raises(InputError, match=expected):
         EstimateDepthOptions(**{"scenes": (Path("a"),), **options}).check()
+
+
+def test_arrays_are_in_metres(scene, tmp_path):
+    maps = write_maps(scene, tmp_path / "maps", lambda p, d, c: d)
+    with pytest.raises(InputError, match=r"--metres-per-count 0.001: is for PNGs"):
+        take(scene, maps, metres_per_count=0.001)

@@ -182,3 +182,25 @@ def test_packed_records_are_unpacked_to_the_same_batch(tmp_path):
     for name in ("indices", "rgb", "prior_distance_m", "prior_sigma_m", "sky"):
         value, other = getattr(found, name), getattr(expected, name)
         assert torch.equal(value, other) and value.dtype == other.dtype, name
+
+
+def test_the_share_with_a_prior(tmp_path):
+    mask = np.ones((100, 100), bool)
+    distance = np.where(np.arange(100) < 50, 5.0, 0.0).astype(np.float32) * np.ones((100, 1), np.float32)
+    table = table_of(tmp_path / "t.npy", [mask], [(distance, distance / 10)])
+    assert table.share_with_prior == 0.5
+    places = table.batch(0, len(table)).indices[:, 1:].numpy() @ [100, 1]
+    assert len(np.unique(places)) == 10_000
+
+
+def test_steps_of_a_quarter_of_a_centimetre():
+    metres = np.array([0, 1, 255.996, 256.0, np.nan, np.inf, -3, 1 / 256])
+    assert to_steps(metres).tolist() == [0, 256, 65535, 0, 0, 0, 0, 1]
+
+
+def test_a_sigma_beyond_16_bits_stays_a_sigma(tmp_path):
+    distance = np.full((1, 4), 5, np.float32)
+    sigma = np.array([[1e-4, 1000.0, 0.5, 0.0]], np.float32)
+    batch = table_of(tmp_path / "t.npy", [np.ones((1, 4), bool)], [(distance, sigma)]).batch(0, 4)
+    stored = {int(column): float(s) for (_, _, column), s in zip(batch.indices, batch.prior_sigma_m, strict=True)}
+    assert stored == {0: 1 / 256, 1: 65535 / 256, 2: 0.5, 3: 0.0}

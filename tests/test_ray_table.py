@@ -10,7 +10,7 @@ from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.model_components.ray_generators import RayGenerator
 
 from edge_depth_nerf.plugin import ray_table
-from edge_depth_nerf.plugin.ray_table import TableRayGenerator, ViewRays
+from edge_depth_nerf.plugin.ray_table import KEPT_VIEWS, TableRayGenerator, ViewRays
 
 
 def cameras(kind: CameraType = CameraType.FISHEYE, **extra) -> Cameras:
@@ -103,3 +103,11 @@ def test_rays_of_a_view_without_a_table_are_nerfstudios_own(extra, monkeypatch):
     rays, expected = ViewRays().of(camera), camera.generate_rays(camera_indices=0, keep_shape=True)
     assert_the_same(rays, expected)
     assert torch.equal(rays.directions, expected.directions)
+
+
+def test_no_more_lenses_are_kept_than_is_said():
+    views, given = ViewRays(), cameras()[:1]
+    for number in range(KEPT_VIEWS + 3):
+        given.fx = given.fx + number
+        views.of(given)
+    assert views._of_lens.cache_info().currsize == KEPT_VIEWS

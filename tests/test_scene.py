@@ -679,3 +679,21 @@ def test_real_fisheye_frame(tmp_path: Path, real_data: Path) -> None:
     assert np.array_equal(written, np.where(kept, lidar, 0))
     assert 25_000 < np.count_nonzero(written) < 50_789
     assert (tmp_path / "scene/images/image_02/0000000000.png").read_bytes() == frame.content.image.read_bytes()  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 20])
+def test_a_short_drive_is_told_how_to_hold_one_out(count: int) -> None:
+    assert sum(held_out_frames(count, best_holdout(count))) >= 1
+
+
+def test_broken_record_is_named(tmp_path: Path) -> None:
+    write(tmp_path / "scene")
+    (tmp_path / "scene/process.json").write_text('{"kind": ')
+    with pytest.raises(InputError, match=r"process\.json: not valid JSON"):
+        write(tmp_path / "scene")
+
+
+def test_downscaled_plane_keeps_the_distance_of_the_block_centre() -> None:
+    # a floor whose distance falls along the rows: the mean of the middle rows' values, not one of them
+    rows = np.repeat(np.linspace(20.0, 19.3, 8)[:, None], 8, 1)
+    np.testing.assert_allclose(downscale_distance(rows, 4)[:, 0], [19.85, 19.45])

@@ -175,3 +175,13 @@ def test_with_several_processes_gradients_go_through_torch(monkeypatch):
     encoding = grid()
     train(encoding, TableAdam(encoding.parameters(), **SETTINGS), range(2))
     assert getattr(encoding.hash_table, SUMS_LATER) is False
+
+
+def test_a_table_without_gradient_is_left_alone():
+    encoding = grid()
+    optimizer = TableAdam(encoding.parameters(), **SETTINGS)
+    (table,) = train(encoding, optimizer, range(1))
+    optimizer.zero_grad()
+    optimizer.step()
+    assert torch.equal(encoding.hash_table, table)
+    assert float(optimizer.state[encoding.hash_table]["step"]) == 1
