@@ -20,6 +20,7 @@ from edge_depth_nerf.kernels.gradients import once
 
 Layers = tuple[Sequence[Tensor], Sequence[Tensor]]
 """Weights, [out, in], and biases, [out], of a network."""
+_ALL = slice(None)
 
 
 def _relu_of_product(bias: Tensor, x: Tensor, weight: Tensor) -> Tensor:
@@ -55,19 +56,21 @@ def _forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], fol
 
 
 def _backward(
-    gradient: Tensor, weights: Sequence[Tensor], entering: Sequence[Tensor], ones: Tensor, into: Layers, on: bool = True
+    gradient: Tensor,
+    weights: Sequence[Tensor],
+    entering: Sequence[Tensor],
+    ones: Tensor,
+    into: Layers,
+    on: slice | None,
 ) -> Tensor | None:
-    """Write the gradients to a network's parameters; if asked for, give that to what enters it."""
+    """Write the gradients to a network's parameters; give that to some columns of what enters it, if to any."""
     to_weights, to_biases = into
     for layer in reversed(range(len(weights))):
         torch.mm(gradient.t(), entering[layer], out=to_weights[layer])
         torch.mm(ones, gradient, out=to_biases[layer][None])
-        if layer == 0 and not on:
-            return None
-        gradient = gradient @ weights[layer]
         if layer > 0:
-            gradient = torch.ops.aten.threshold_backward(gradient, entering[layer], 0)
-    return gradient
+            gradient = torch.ops.aten.threshold_backward(gradient @ weights[layer], entering[layer], 0)
+    return None if on is None else gradient @ weights[0][:, on]
 
 
 class _Network(torch.autograd.Function):
@@ -92,7 +95,7 @@ class _Network(torch.autograd.Function):
             into = _parts_of(flat, parameters)
             ones = gradient.new_ones(1, len(gradient))
             weights, layers = ctx.made[:count], (into[:count], into[count:])
-            to_x = _backward(gradient, weights, entering, ones, layers, ctx.needs_input_grad[0])
+            to_x = _backward(gradient, weights, entering, ones, layers, _ALL if ctx.needs_input_grad[0] else None)
             return None if to_x is None else to_x.to(x.dtype), *_parts_of(flat.to(parameters[0].dtype), parameters)
 
         to_x, *to_parameters = once("The network by products", compute, gradients[0], x, *parameters)
@@ -121,55 +124,55 @@ class _Field(torch.autograd.Function):
         made = _in_type(parameters, dtype)
         weights, biases = made[: len(made) // 2], made[len(made) // 2 :]
         *entering, features = _forward(encoded.detach().to(dtype), weights[:count], biases[:count], follow)
+        rows = weights[count]
         # the density is no input of the second network: it has the weight 0
-        rows, width = weights[count], features.shape[1]
-        own = rows[:, directions - 1 : directions - 1 + width].clone()
-        own[:, 0].zero_()
-        by_ray = _without(rows, directions, width - 1)
-        rays = of_rays.detach().to(dtype)
-        shared, hidden = torch.addmm(biases[count], rays, by_ray.t()), features @ own.t()
-        for number, of_run, of_points in _by_run(runs, shared, hidden):
-            of_points.view(len(of_run), number, -1).add_(of_run[:, None])
-        *behind, before_sigmoid = _forward(hidden.relu_(), weights[count + 1 :], biases[count + 1 :], follow)
+        weights[count] = torch.cat([rows[:, :directions], rows.new_zeros(len(rows), 1), rows[:, directions:]], 1)
+        own = slice(directions, directions + features.shape[1])
+        points = features.new_empty(len(features), weights[count].shape[1])
+        points[:, own].copy_(features)
+        for of_points, of_run in _by_run(runs, points, of_rays.detach()):
+            of_points[..., :directions].copy_(of_run[..., :directions])
+            if own.stop < points.shape[1]:
+                of_points[..., own.stop :].copy_(of_run[..., directions:])
+        *behind, before_sigmoid = _forward(points, weights[count:], biases[count:], follow)
         colours = torch.sigmoid(before_sigmoid, out=torch.empty_like(before_sigmoid, dtype=torch.float32))
         if follow:
-            ctx.form, ctx.made, ctx.multiplied = form, made, (own, by_ray)
+            ctx.form, ctx.weights, ctx.own = form, weights, own
             ctx.counts = len(parameters), len(entering)
-            ctx.save_for_backward(encoded, of_rays, colours, features, rays, *parameters, *entering, *behind)
+            ctx.save_for_backward(encoded, of_rays, colours, *parameters, *entering, *behind)
         rays_first, each = runs[0]
         return features[: rays_first * each, 0].clone(), colours
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        encoded, of_rays, colours, features, rays, *saved = ctx.saved_tensors
-        (runs, directions, count, _, _), made, (own, by_ray) = ctx.form, ctx.made, ctx.multiplied
+        encoded, of_rays, colours, *saved = ctx.saved_tensors
+        (runs, directions, count, _, _), weights, own = ctx.form, ctx.weights, ctx.own
         parameters, entering = saved[: ctx.counts[0]], saved[ctx.counts[0] : sum(ctx.counts)]
         behind = saved[sum(ctx.counts) :]
 
         def compute() -> tuple[Tensor | None, ...]:
             to_before, to_colours = gradients
-            flat = features.new_empty(sum(each.numel() for each in parameters))
+            flat = behind[0].new_empty(sum(each.numel() for each in parameters))
             into = _parts_of(flat, parameters)
-            half = len(parameters) // 2
-            weights, to_weights, to_biases = made[:half], into[:half], into[half:]
-            ones = features.new_ones(1, len(features))
-            gradient = torch.empty_like(colours, dtype=features.dtype)
+            to_weights, to_biases = into[: len(weights)], into[len(weights) :]
+            ones = flat.new_ones(1, len(colours))
+            gradient = torch.empty_like(colours, dtype=flat.dtype)
             torch.ops.aten.sigmoid_backward.grad_input(to_colours, colours, grad_input=gradient)
-            rest = to_weights[count + 1 :], to_biases[count + 1 :]
-            to_hidden = _backward(gradient, weights[count + 1 :], behind, ones, rest)
-            assert to_hidden is not None
-            to_hidden = torch.ops.aten.threshold_backward(to_hidden, behind[0], 0)
-            to_shared = to_hidden.new_empty(len(rays), to_hidden.shape[1])
-            for number, of_run, of_points in _by_run(runs, to_shared, to_hidden):
-                torch.sum(of_points.view(len(of_run), number, -1), 1, out=of_run)
-            to_own, to_by_ray = to_hidden.t() @ features, to_shared.t() @ rays
-            torch.cat([to_by_ray[:, :directions], to_own[:, 1:], to_by_ray[:, directions:]], 1, out=to_weights[count])
-            torch.mm(ones[:, : len(to_shared)], to_shared, out=to_biases[count][None])
-            to_features = to_hidden @ own
-            to_features[: len(to_before), 0].copy_(to_before)
+            to_rows = torch.empty_like(weights[count])
+            second = [to_rows, *to_weights[count + 1 :]], to_biases[count:]
+            learns_rays = ctx.needs_input_grad[1]
+            to_points = _backward(gradient, weights[count:], behind, ones, second, _ALL if learns_rays else own)
+            assert to_points is not None
+            torch.cat([to_rows[:, :directions], to_rows[:, directions + 1 :]], 1, out=to_weights[count])
+            to_rays = None
+            if learns_rays:
+                parts = _by_run(runs, torch.cat([to_points[:, :directions], to_points[:, own.stop :]], 1), of_rays)
+                to_rays = torch.cat([of_points.sum(1) for of_points, _ in parts]).to(of_rays.dtype)
+                to_points = to_points[:, own]
+            to_points[: len(to_before), 0].copy_(to_before)
+            on = _ALL if ctx.needs_input_grad[0] else None
             first = to_weights[:count], to_biases[:count]
-            to_encoded = _backward(to_features, weights[:count], entering, ones, first, ctx.needs_input_grad[0])
-            to_rays = (to_shared @ by_ray).to(of_rays.dtype) if ctx.needs_input_grad[1] else None
+            to_encoded = _backward(to_points, weights[:count], entering, ones, first, on)
             to_encoded = None if to_encoded is None else to_encoded.to(encoded.dtype)
             return to_encoded, to_rays, *_parts_of(flat.to(parameters[0].dtype), parameters)
 
@@ -178,18 +181,11 @@ class _Field(torch.autograd.Function):
         return to_encoded, to_rays, None, *to_parameters
 
 
-def _without(rows: Tensor, first: int, count: int) -> Tensor:
-    """Give a matrix without some of its columns."""
-    if first + count == rows.shape[1]:
-        return rows[:, :first]
-    return torch.cat([rows[:, :first], rows[:, first + count :]], 1)
-
-
-def _by_run(runs: Sequence[tuple[int, int]], of_rays: Tensor, of_points: Tensor) -> list[tuple[int, Tensor, Tensor]]:
-    """Give, of each run, the number of points of a ray, its rays and its points."""
-    rays, numbers = zip(*runs, strict=True)
-    of_runs = of_points.split([count * number for count, number in runs])
-    return list(zip(numbers, of_rays.split(list(rays)), of_runs, strict=True))
+def _by_run(runs: Sequence[tuple[int, int]], of_points: Tensor, of_rays: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Give, of each run, its points and its rays, [rays, points of a ray, columns] and [rays, 1, columns]."""
+    points = of_points.split([count * number for count, number in runs])
+    rays = of_rays.split([count for count, _ in runs])
+    return [(p.view(*run, p.shape[1]), r[:, None]) for run, p, r in zip(runs, points, rays, strict=True)]
 
 
 def field(
@@ -204,7 +200,7 @@ def field(
     """Apply a field's two networks to points on rays, differentiable once by all it is given.
 
     The first network's first output becomes the density, its others enter the second one behind a ray's direction and
-    in front of what else a ray has. What a ray has is multiplied once a ray.
+    in front of what else a ray has.
 
     Args:
         encoded: what enters the first network, of any type.

@@ -362,8 +362,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
 
 def _of_use(distance_m: Tensor, sigma_m: Tensor, sky: Tensor) -> Tensor:
     """Say whether a pixel shows the sky, or a surface whose prior is not too vague."""
-    vague = sigma_m > SURFACE_SIGMA_M + SURFACE_SIGMA_SHARE * distance_m
-    return sky | (distance_m > 0) & ~vague
+    clear = sigma_m.sub(distance_m, alpha=SURFACE_SIGMA_SHARE) <= SURFACE_SIGMA_M
+    return sky | (distance_m > 0) & clear
 
 
 def _of_surface(values: dict[str, Tensor]) -> dict[str, Tensor]:

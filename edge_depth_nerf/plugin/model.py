@@ -334,7 +334,7 @@ class EdgeDepthNerfModel(NerfactoModel):
             self.camera_optimizer.apply_to_raybundle(batch["surface_rays"])
             bundles.append(batch["surface_rays"])
             distance = draw_surface_m(batch, self.planes) / self.metres_per_unit
-            distances.append(torch.where(batch["surface_sky"][:, 0], INFINITELY_FAR, distance))
+            distances.append(distance.masked_fill(batch["surface_sky"][:, 0], INFINITELY_FAR))
         return points_on(bundles, distances, self.fused) if bundles else None
 
     def _exposed(self, colours: list[Tensor], bundles: list[RayBundle]) -> Sequence[Tensor]:

@@ -84,14 +84,15 @@ def decode(packed: UInt8[Tensor, "n 15"]) -> PixelBatch:
     """Unpack the bytes of `PixelTable.records` where they are; a GPU then gets 15 bytes a pixel and not 53."""
     # distance, sigma, low and high half of the picture's number, row, column
     words = packed[:, 3:].contiguous().view(torch.int16).int() & 0xFFFF
-    distance, sigma = words[:, :1], words[:, 1:2]
-    sky = (distance == 0) & (sigma == SKY)
-    picture = words[:, 2:3] + (words[:, 3:4] << 16)
+    # only without a distance is the difference so large
+    sky = words[:, 1:2] - words[:, :1] == SKY
+    picture = words[:, 2:3].add(words[:, 3:4], alpha=1 << 16)
+    distance_m, sigma_m = (words[:, :2] / DISTANCE_STEPS_PER_METRE).split(1, dim=1)
     return PixelBatch(
         indices=torch.cat([picture, words[:, 4:]], dim=1).long(),
         rgb=packed[:, :3] / 255,
-        prior_distance_m=distance / DISTANCE_STEPS_PER_METRE,
-        prior_sigma_m=sigma.masked_fill(sky, 0) / DISTANCE_STEPS_PER_METRE,
+        prior_distance_m=distance_m,
+        prior_sigma_m=sigma_m.masked_fill(sky, 0),
         sky=sky,
     )
 

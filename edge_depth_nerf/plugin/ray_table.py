@@ -95,10 +95,9 @@ class TableRayGenerator(RayGenerator):
     """nerfstudio's `RayGenerator`, for cameras that share a few lenses; rays differ by float32's noise at most."""
 
     table: Tensor
-    first: Tensor
-    """Where the rays of each camera's lens begin."""
+    lenses: Tensor
+    """Where the rays of each camera's lens begin, and its width."""
     poses: Tensor
-    widths: Tensor
 
     def __init__(self, cameras: Cameras, folder: Path) -> None:
         """Make the table, or find it in `folder`; where that cannot be written the table stays in memory."""
@@ -125,9 +124,8 @@ class TableRayGenerator(RayGenerator):
         first = torch.cumsum(pixels, 0) - pixels
         for name, value in (
             ("table", table),
-            ("first", first[lens]),
+            ("lenses", torch.stack([first[lens], cameras.width[:, 0].cpu()], dim=1)),
             ("poses", cameras.camera_to_worlds.detach()),
-            ("widths", cameras.width[:, 0]),
         ):
             self.register_buffer(name, value.to(cameras.device), persistent=False)
 
@@ -145,7 +143,8 @@ class TableRayGenerator(RayGenerator):
     def forward(self, ray_indices: Int[Tensor, "num_rays 3"]) -> RayBundle:
         """Give the rays of pixels: picture, row and column."""
         picture, row, column = ray_indices.unbind(-1)
-        place = self.first[picture] + row * self.widths[picture] + column
+        first, width = self.lenses[picture].unbind(-1)
+        place = torch.addcmul(first + column, row, width)
         # torch would count these from the end
         if place.device.type == "cpu" and bool(((picture | place) < 0).any()):
             raise IndexError(f"Pixels from {ray_indices.amin(0).tolist()} (picture, row, column) on were asked for.")

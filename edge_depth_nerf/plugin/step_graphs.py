@@ -15,7 +15,6 @@ its step is done already. What torch leaves in the state of recording is restore
 from __future__ import annotations
 
 import copy
-import functools
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -287,7 +286,7 @@ class StepGraphs:
         with self._on_device(), torch.autocast(device_type, enabled=trainer.mixed_precision):
             manager = pipeline.datamanager
             outputs, losses, metrics = pipeline.computed(*manager.batch_of(manager.packed()))
-            loss = functools.reduce(torch.add, losses.values())
+            loss = torch.stack([*losses.values()]).sum()
             with torch.autocast(device_type, enabled=False):
                 gradients = torch.autograd.grad(trainer.grad_scaler.scale(loss), self._parameters, allow_unused=True)
                 for parameter, gradient in zip(self._parameters, gradients, strict=True):

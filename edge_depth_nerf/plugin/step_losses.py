@@ -142,14 +142,14 @@ class SurfaceLoss:
 
     def __call__(self, step: Step) -> Float[Tensor, ""]:
         """Give the weighted loss."""
-        batch, weight = step.batch, self.mult
-        counts = surface_counts(batch, step.planes)
-        if "surface_counts" in batch:
-            served = batch["surface_counts"][:, 0]
-            weight = weight * (len(served) / served.sum().clamp(min=1))
+        batch, image = step.batch, step.batch["surface_image"]
         # no error of others; choosing pixels would make a GPU wait
-        image = batch["surface_image"]
-        return weight * (torch.where(counts[:, None], step.outputs["surface_rgb"], image) - image).square().mean()
+        counts = surface_counts(batch, step.planes)[:, None]
+        loss = torch.nn.functional.mse_loss(torch.where(counts, step.outputs["surface_rgb"], image), image)
+        if "surface_counts" not in batch:
+            return self.mult * loss
+        served = batch["surface_counts"][:, 0]
+        return self.mult * len(served) * loss / served.sum().clamp(min=1)
 
 
 def step_losses_of(config: Any) -> dict[str, StepLoss]:
@@ -193,10 +193,10 @@ def draw_surface_m(batch: Mapping[str, Any], planes: Planes) -> Float[Tensor, "p
     to its other side.
     """
     distance_m, sigma_m = batch["surface_distance_m"][:, 0], batch["surface_sigma_m"][:, 0]
-    off_m = sigma_m * torch.randn_like(sigma_m)
-    drawn_m = distance_m + off_m
+    noise = torch.randn_like(sigma_m)
+    drawn_m, mirrored_m = (torch.addcmul(distance_m, sigma_m, noise, value=side) for side in (1, -1))
     beyond = drawn_m != drawn_m.clamp(planes.near_m, planes.far_m)
-    return torch.where(beyond, distance_m - off_m, drawn_m).clamp(planes.near_m, planes.far_m)
+    return torch.where(beyond, mirrored_m, drawn_m).clamp(planes.near_m, planes.far_m)
 
 
 def distortion_loss(edges: Float[Tensor, "rays edges"], weights: Float[Tensor, "rays samples"]) -> Float[Tensor, ""]:
