@@ -30,14 +30,14 @@ STEPS = 24
 class RunAgain:
     """In place of CUDA graphs: a function that is run again, and whose results go where those of the recording are.
 
-    Like a recording, it computes nothing the first time. It may fail, and then random numbers are refused, as torch's
-    generator does it, until what a failure leaves is restored.
+    Like a recording, it computes nothing the first time. Random numbers are refused while it records or runs again; and
+    after a failure, as torch's generator does it, until what that leaves is restored.
     """
 
     def __init__(self, trainer: EdgeDepthTrainer, fails: str = "", failures: int = 99) -> None:
         self.trainer, self.fails, self.failures = trainer, fails, failures
         self.recorded = self.replays = self.recovered = 0
-        self.is_spoilt = False
+        self.is_spoilt = self.records = False
 
     def stream(self) -> Any:
         return contextlib.nullcontext()
@@ -47,16 +47,23 @@ class RunAgain:
             if self.failures and (self.fails in ("middle", "end") or (self.fails == "second" and self.recorded == 1)):
                 self.failures -= 1
                 self._fail(work)
-            kept = work()
+            kept = self._drawing_nothing(work)
         self.recorded += 1
 
         def replay() -> None:
             self.replays += 1
-            for place, value in zip(tree_leaves(kept), tree_leaves(work()), strict=True):
+            for place, value in zip(tree_leaves(kept), tree_leaves(self._drawing_nothing(work)), strict=True):
                 if isinstance(place, torch.Tensor):
                     place.copy_(value)
 
         return kept, replay
+
+    def _drawing_nothing(self, work: Any) -> Any:
+        self.records = True
+        try:
+            return work()
+        finally:
+            self.records = False
 
     def recover(self) -> None:
         self.recovered += 1
@@ -118,14 +125,16 @@ def trainer_in(folder: Path, name: str, **changes: Any) -> EdgeDepthTrainer:
 def with_graphs(trainer: EdgeDepthTrainer, monkeypatch: pytest.MonkeyPatch, **fails: Any) -> RunAgain:
     capture = RunAgain(trainer, **fails)
     trainer.graphs = StepGraphs(trainer, capture)
-    for name in ("rand", "randn_like"):
-        draw = getattr(torch, name)
+    drawers = [(torch, "rand"), (torch, "randn"), (torch.Tensor, "uniform_"), (torch.Tensor, "normal_")]
+    for holder, name in drawers:
+        draw = getattr(holder, name)
 
         def drawn(*args: Any, draw: Any = draw, **kwargs: Any) -> Any:
             assert not capture.is_spoilt, "Offset increment outside graph capture encountered unexpectedly."
+            assert not capture.records, "a recorded step draws random numbers"
             return draw(*args, **kwargs)
 
-        monkeypatch.setattr(torch, name, drawn)
+        monkeypatch.setattr(holder, name, drawn)
     return capture
 
 

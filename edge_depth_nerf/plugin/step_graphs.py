@@ -4,8 +4,8 @@ Host-facing. The host needs several times longer to launch the kernels of a step
 two kinds of steps, with and without an update of the proposal networks, is recorded once as a CUDA graph and replayed.
 
 A graph reads where it read when it was recorded. What differs between steps is put there before: the batch (on a table
-that lies on the device the graph advances by itself), λ, how far the sampler's weights are annealed, and the learning
-rates. Anything else that changes (rays, parameters or options) ends this with one line that says why.
+that lies on the device the graph advances by itself), random numbers, λ, how far the sampler's weights are annealed,
+and the learning rates. Anything else that changes (rays, parameters or options) ends this with one line that says why.
 
 Nothing may be compiled, loaded or tried out in a recording. So the first steps run unrecorded, by the same function, on
 the stream that records; a kind of step is recorded after it has run that way. If a recording fails, nothing is lost:
@@ -26,6 +26,7 @@ from nerfstudio.model_components.ray_samplers import ProposalNetworkSampler
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from edge_depth_nerf.plugin.fused.noise import Noise
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 from edge_depth_nerf.plugin.step_losses import PriorLoss
 
@@ -160,6 +161,7 @@ class StepGraphs:
         self._parameters = [each for group in trainer.optimizers.parameters.values() for each in group]
         self._groups = [group for optimizer in self._optimizers for group in optimizer.param_groups]
         self._numbers = Numbers(2 + len(self._groups), trainer.device)
+        self._noise = Noise(trainer.device)
         self._recorded: dict[bool, _Recorded] = {}
         self._taken: Counter[bool] = Counter()
         self._failures = 0
@@ -193,6 +195,7 @@ class StepGraphs:
         self._pipeline.detail.forget()
         self._pipeline.datamanager.set_next(step)
         self._numbers.hold(self._numbers_now())
+        self._noise.draw()
         if (recorded := self._recorded.get(updates)) is not None:
             recorded.replay()
             # nerfstudio's sampler counts steps itself, where it is asked
@@ -228,6 +231,7 @@ class StepGraphs:
         pipeline = self._pipeline
         return (
             pipeline.datamanager.rays_of_a_step(),
+            self._noise.asked,
             pipeline.training,
             pipeline.model.config,
             tuple((each.data_ptr(), each.requires_grad) for each in self._parameters),
@@ -283,7 +287,7 @@ class StepGraphs:
         device_type = torch.device(trainer.device).type
         # a cast that autocast has kept from before would not be part of a recording
         torch.clear_autocast_cache()
-        with self._on_device(), torch.autocast(device_type, enabled=trainer.mixed_precision):
+        with self._on_device(), self._noise.given(), torch.autocast(device_type, enabled=trainer.mixed_precision):
             manager = pipeline.datamanager
             outputs, losses, metrics = pipeline.computed(*manager.batch_of(manager.packed()))
             loss = torch.stack([*losses.values()]).sum()

@@ -22,6 +22,7 @@ from edge_depth_nerf.kernels import formulas
 from edge_depth_nerf.kernels.functions import DISTORTION_LOSS, INTERLEVEL_LOSS
 from edge_depth_nerf.method.depth_losses import LOSSES, VARIABLE, DepthLoss, Level, depth_loss, register
 from edge_depth_nerf.method.losses import sky_loss
+from edge_depth_nerf.plugin.fused.noise import normal
 from edge_depth_nerf.plugin.fused.ray_samplers import edges_between, edges_of
 
 register(os.environ.get(VARIABLE, ""))
@@ -193,7 +194,7 @@ def draw_surface_m(batch: Mapping[str, Any], planes: Planes) -> Float[Tensor, "p
     to its other side.
     """
     distance_m, sigma_m = batch["surface_distance_m"][:, 0], batch["surface_sigma_m"][:, 0]
-    noise = torch.randn_like(sigma_m)
+    noise = normal(len(sigma_m), sigma_m.device)
     drawn_m, mirrored_m = (torch.addcmul(distance_m, sigma_m, noise, value=side) for side in (1, -1))
     beyond = drawn_m != drawn_m.clamp(planes.near_m, planes.far_m)
     return torch.where(beyond, mirrored_m, drawn_m).clamp(planes.near_m, planes.far_m)

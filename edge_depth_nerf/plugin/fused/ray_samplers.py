@@ -16,6 +16,7 @@ from nerfstudio.model_components.ray_samplers import PDFSampler, ProposalNetwork
 from torch import Tensor
 
 from edge_depth_nerf.kernels.functions import DISTANCES, SAMPLE_PDF, WEIGHTS
+from edge_depth_nerf.plugin.fused.noise import uniform
 
 
 class FirstSampler(UniformLinDispPiecewiseSampler):
@@ -36,7 +37,7 @@ class FirstSampler(UniformLinDispPiecewiseSampler):
         lower, lengths = self._between(count, device)
         nears, fars = ray_bundle.nears, ray_bundle.fars
         if self.train_stratified and self.training:
-            drawn = torch.rand(len(ray_bundle), 1 if self.single_jitter else count + 1, device=device)
+            drawn = uniform(len(ray_bundle), 1 if self.single_jitter else count + 1, device)
             edges = torch.addcmul(lower, lengths, drawn)
         else:
             edges = torch.linspace(0, 1, count + 1, device=device).expand(len(ray_bundle), -1)
@@ -86,7 +87,7 @@ class FusedPDFSampler(PDFSampler):
             self._even[places, device] = torch.linspace(0, 1 - 1 / places, places, device=device)
         wanted = self._even[places, device].expand(len(weights), -1)
         if self.train_stratified and self.training:
-            drawn = torch.rand(len(weights), 1 if self.single_jitter else places, device=device)
+            drawn = uniform(len(weights), 1 if self.single_jitter else places, device)
             wanted = torch.add(wanted, drawn, alpha=1 / places)
         else:
             wanted = wanted + 1 / (2 * places)
