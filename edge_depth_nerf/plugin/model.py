@@ -160,16 +160,13 @@ class EdgeDepthNerfModel(NerfactoModel):
             for network in (self.field, *self.proposal_networks):
                 network.spatial_distortion = CubeContraction(order=float("inf"))
         self._set_renderers()
-        self.exposure, self.lpips = exposure, LpipsAtFirstUse()
-        self.psnr = Psnr()
-        self._step = 0
-        self._training_steps = USUAL_STEPS
+        self.exposure, self.lpips, self.psnr = exposure, LpipsAtFirstUse(), Psnr()
+        self._step, self._training_steps = 0, USUAL_STEPS
         self.scheduled_weight: Tensor | None = None
         """λ where it is a tensor, which can change without the host."""
         self.detail: TrainingDetail | None = None
         """Of the training pictures; the pipeline sets it."""
-        self._view_rays = ViewRays()
-        self.evaluation = ViewEvaluation()
+        self._view_rays, self.evaluation = ViewRays(), ViewEvaluation()
 
     def _settle(self) -> None:
         """Decide what computes, and turn our options into nerfacto's."""
@@ -303,8 +300,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         background = background_of(self.config.background_color, self._has_sky, sky)
         of_nerfacto = self.renderer_rgb, self.renderer_accumulation, self.config.use_gradient_scaling
         rendered = render(self.field, samples, points, background, *of_nerfacto)
-        weights_list.append(rendered.weights[..., None])
-        samples_list.append(samples)
+        weights_list, samples_list = [*weights_list, rendered.weights[..., None]], [*samples_list, samples]
         outputs: dict[str, Any] = {"rgb": rendered.rgb, "accumulation": rendered.accumulation}
         outputs |= depths(weights_list, samples_list, self.renderer_depth, self.renderer_expected_depth)
         if self.training:
@@ -402,10 +398,8 @@ class EdgeDepthNerfModel(NerfactoModel):
             losses = super().get_loss_dict(outputs, batch, metrics_dict)
         if self.training:
             step = Step(outputs, batch, self.planes, self._share_done(), self.depth_weight())
-            wanted = self.step_losses
-            if "surface_rgb" not in outputs:
-                wanted.pop("surface_loss", None)
-            losses |= {name: loss(step) for name, loss in wanted.items()}
+            left_out = () if "surface_rgb" in outputs else ("surface_loss",)
+            losses |= {name: loss(step) for name, loss in self.step_losses.items() if name not in left_out}
         return losses
 
     def _nerfacto_losses(
