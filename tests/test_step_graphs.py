@@ -265,6 +265,7 @@ def test_what_was_not_recorded_is_computed_and_reported_once(folder, capsys, mon
         (pipeline.datamanager.train_pixel_sampler, "num_rays_per_batch", 48),
         (next(pipeline.model.field.parameters()), "requires_grad", False),
         (pipeline.model.config, "sky_loss_mult", 0.0),
+        (trainer.graphs._noise, "asked", [1, 1]),
     ):
         assert trainer.graphs._state() == trainer.graphs._seen
         before = getattr(holder, name)
