@@ -48,8 +48,9 @@ def test_it_runs_without_waiting_and_in_so_many_kernels(counts, case):
     # torch's operations move so much
     assert 0 < found["gigabytes"] <= MOST[case][1], found["parts"]
     if "view" not in case:
-        # a graph; beside it λ, the exponent of annealed weights and the learning rates are written, nothing uploaded
-        assert found["uploads"] == [] and found["parts"]["beside the graph"]["kernels"] <= 5
+        # a graph; beside it λ, the exponent of annealed weights and the learning rates are written, and random numbers
+        # drawn in two calls; nothing is uploaded
+        assert found["uploads"] == [] and found["parts"]["beside the graph"]["kernels"] <= 6
 
 
 def test_the_field_is_asked_once_and_directions_once_a_ray(counts):
