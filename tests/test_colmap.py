@@ -24,7 +24,6 @@ from edge_depth_nerf.process.colmap import models as colmap_models
 from edge_depth_nerf.process.colmap import poses as colmap_poses_module
 from edge_depth_nerf.process.colmap.models import ColmapModel, SparseView, colmap_lens
 from edge_depth_nerf.process.colmap.poses import NOT_REGISTERED, colmap_poses
-from edge_depth_nerf.process.colmap.refine import refine_poses
 from edge_depth_nerf.process.colmap.scale import find_scale_break, join_models, metric_path
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.kitti360.converter import read_kitti360
@@ -676,13 +675,3 @@ def test_a_drive_with_disturbed_poses_becomes_a_scene_with_better_ones(drive, tm
     written = (options.output / "transforms.json").read_bytes()
     assert not convert(options, QUIET).written
     assert (options.output / "transforms.json").read_bytes() == written
-
-
-@pytest.mark.slow
-def test_true_poses_of_a_drive_stay(drive, tmp_path):
-    pytest.importorskip("pycolmap")
-    options = options_of(drive, tmp_path / "scene")
-    recording = read_drive(options)
-    refined = refine_poses(recording, options, QUIET)
-    assert "given poses are used unchanged" in refined.notices[-1]
-    assert refined.pictures == recording.pictures

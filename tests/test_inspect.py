@@ -3,13 +3,10 @@
 import io
 import math
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +41,6 @@ from edge_depth_nerf.base.pictures import (
     text_bar,
     tinted,
 )
-from edge_depth_nerf.entry import main
 from edge_depth_nerf.inspecting import figures
 from edge_depth_nerf.inspecting.command import inspect_scene
 from edge_depth_nerf.inspecting.figures import map_figures, measure, measured_frames
@@ -189,18 +185,6 @@ def test_its_counts(sample, sample_drive):
     for words in ("22 for training, 2 held out", "8.9 m (image_02)", "KANNALA_BRANDT for MEI", "128×128"):
         assert words in said
     assert "measured on all pictures" in said and "Error of the monocular maps" in said
-
-
-def test_its_path(sample, sample_drive):
-    path = sample[0]["path"]
-    poses = [frame["transform_matrix"] for frame in frames_of(sample_drive, path["camera"])]
-    steps = [sum((after[row][3] - before[row][3]) ** 2 for row in range(3)) ** 0.5 for before, after in pairwise(poses)]
-    assert path["length_m"] == pytest.approx(sum(steps), rel=1e-5)
-    assert path["spacing_median_m"] == pytest.approx(sorted(steps)[5], rel=1e-5)
-    assert path["spacing_max_m"] == pytest.approx(max(steps), rel=1e-5)
-    times = [frame["timestamp_s"] for frame in frames_of(sample_drive, path["camera"])]
-    assert path["duration_s"] == pytest.approx(times[-1] - times[0], rel=1e-5)
-    assert path["speed_mean_mps"] == pytest.approx(sum(steps) / (times[-1] - times[0]), rel=1e-5)
 
 
 @pytest.mark.parametrize("camera", ["image_02", "image_03"])
@@ -638,23 +622,6 @@ def test_a_scene_that_cannot_be_read(drive, tmp_path, words):
 def test_options_that_cannot_be_used(drive, options, words):
     with pytest.raises(InputError, match=words):
         look(drive, **{"output": drive / options.pop("output", "out"), **options})
-
-
-def test_the_command_runs_without_nerfstudio(tmp_path, monkeypatch, capsys):
-    """Importing nerfstudio takes longer than the whole command."""
-    drive = write_drive(tmp_path / "drive", 1)
-    code = (
-        "import sys; sys.modules['nerfstudio'] = None; from edge_depth_nerf.entry import main; "
-        f"sys.argv = ['edge-depth-nerf', 'inspect', {str(drive)!r}, '--output', {str(tmp_path / 'out')!r}, "
-        "'--frames', '1']; main()"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "out" / "top_view.png").is_file()
-    monkeypatch.setattr(sys, "argv", ["edge-depth-nerf", "inspect", str(drive), "--frames", "0"])
-    with pytest.raises(SystemExit, match="2"):
-        main()
-    assert capsys.readouterr().err.startswith("edge-depth-nerf: --frames 0")
 
 
 # ---- drawing ---------------------------------------------------------------------------------------------------

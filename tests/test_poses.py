@@ -109,11 +109,3 @@ def test_a_broken_transforms_json_is_named(tmp_path: Path, content: dict, messag
 def test_what_is_no_matrix_is_said(rows: object) -> None:
     with pytest.raises(InputError, match="here: expected 4 rows of 4 numbers"):
         transform_of_rows(rows, "here")
-
-
-def test_a_doubled_time_in_many_lines_is_left_out(tmp_path: Path) -> None:
-    lines = [f"{number} {number} 0 0 0 0 0 1" for number in range(200)]
-    lines.insert(31, "30 30.5 0 0 0 0 0 1")
-    times, poses, doubled = read_tum(text(tmp_path, "\n".join(lines)))
-    assert times.tolist() == list(range(200)) and doubled == [32]
-    assert poses[30, 0, 3] == 30

@@ -255,24 +255,3 @@ def test_maps_are_enlarged_on_surfaces_and_kept_apart_at_jumps() -> None:
     np.testing.assert_allclose(large[:4, 5], 4.2, rtol=0.02)
     np.testing.assert_allclose(large[:4, 6], 9.0, rtol=1e-6)
     assert enlarged(found, 1, (3, 6)) is distance
-
-
-def test_each_picture_is_confirmed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two layers are made of it, and a run that was stopped while it wrote them does not confirm anew."""
-    scene = write_ball_scene(tmp_path)
-    confirm, confirmed = Motion.confirm, []
-
-    def counted(self: Motion, index: int, sweeps: Any) -> MotionDistance:
-        confirmed.append(index)
-        return confirm(self, index, sweeps)
-
-    def stopped(*_: Any, **__: Any) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Motion, "confirm", counted)
-    with monkeypatch.context() as patch:
-        patch.setattr("edge_depth_nerf.process.motion.write_maps", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            add(scene)
-    add(scene)
-    assert sorted(confirmed) == [0, 1, 2, 3, 4]

@@ -640,26 +640,3 @@ def test_jpegs_and_patterns(mine: Path) -> None:
     (mine / "front_3.jpg").write_bytes(b"\xff\xd8\xff")
     with pytest.raises(InputError, match=r"front_3\.jpg: cannot be decoded as a picture"):
         read(mine, cameras=("front",))
-
-
-def test_missing_echoes_in_the_vehicles_frame_are_no_points(mine: Path) -> None:
-    """A recorder that moves the whole cloud moves them to the scanner's place."""
-    edit(mine, ('timestamp = "start"', 'timestamp = "start"\npoints_in = "vehicle"'))
-    sweep = read(mine).sweeps[1]
-    points = sweep.read()
-    place = sweep.to_vehicle[:3, 3]
-    lines = sweep.path.read_bytes().partition(b"DATA binary\n")
-    values = np.frombuffer(lines[2], RECORD).copy()
-    for name, number in zip("xyz", place, strict=True):
-        values[name][:7] = number
-    sweep.path.write_bytes(lines[0] + lines[1] + values.tobytes())
-    without = read(mine).sweeps[1].read()
-    assert without.out_of_range == points.out_of_range + 7
-    assert len(without.points_m) == len(points.points_m) - 7 and without.points_m.norm(dim=-1).min() > 0.5
-
-
-def test_times_of_the_pictures_reach_the_scene(scene: Path) -> None:
-    times = {frame["frame"]: frame["timestamp_s"] for frame in read_json(scene / "transforms.json")["frames"]}
-    assert [times[number] - times[0] for number in range(FRAMES)] == pytest.approx(
-        [0.1 * number for number in range(FRAMES)], abs=0.02
-    )

@@ -1,4 +1,4 @@
-"""The plugin runs: a tiny scene, some steps of nerfstudio's trainer, finite losses. `make test-fast` has this of it."""
+"""The plugin runs: a tiny scene, some steps of nerfstudio's trainer, finite losses. For `make test-fast` alone."""
 
 import json
 import math
@@ -32,7 +32,9 @@ def main(scene: Path, folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("may_start_programs")
-def test_some_steps_have_finite_losses_and_a_checkpoint(tmp_path: Path) -> None:
+def test_some_steps_have_finite_losses_and_a_checkpoint(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    if not request.config.getoption("--fast"):
+        pytest.skip("test_same_twice.py and test_finite.py train, too")
     scene = write_scene(tmp_path / "scene", [fisheye(24, 20)], frames=5)
     command = [sys.executable, __file__, scene, tmp_path / "runs"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=240)
