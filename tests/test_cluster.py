@@ -124,24 +124,6 @@ def test_jobs_without_a_cluster_go_side_by_side(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_workers_task_goes_on_where_it_was(tmp_path: Path) -> None:
-    console = Console(file=io.StringIO(), width=200)
-    tasks = [steps(tmp_path, "long", 0.5), steps(tmp_path, "short"), steps(tmp_path, "third")]
-    killer = kill_worker_of("long.kept", lambda: (tmp_path / "long.kept").exists())
-    with on_cluster("local", tasks, [tmp_path], console) as place:
-        do_tasks(tasks, place, console)
-    killer.join()
-    for task in tasks:
-        assert (tmp_path / f"{task.title}.kept").read_text() == "0 1 2 3 "  # no step twice
-    assert (tmp_path / "logs" / "long.log").read_text().count("$ ") == 2
-    assert (tmp_path / "logs" / "short.log").read_text().count("$ ") == 1
-    said = console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
-    assert f"Cluster local: {min(3, os.cpu_count() or 1)} worker" in said and "long: worker lost" in said
-    assert said.count("worker lost; continuing on") == 1
-    assert not list(tmp_path.glob("logs/.cluster-*")) and child_of_worker("kept") is None
-
-
-@pytest.mark.slow
 def test_a_task_that_fails_is_not_done_again_and_names_its_log(tmp_path: Path) -> None:
     wrong = steps(tmp_path, "wrong", code="import sys; print('calib.txt: is empty'); sys.exit(2)")
     others = [steps(tmp_path, name, 60.0) for name in "abcd"]
@@ -288,7 +270,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 
 def test_a_command_line_gives_the_options_back(tmp_path: Path) -> None:
-    chosen: dict[str, Any] = {"first": 7, "frames": 3, "cameras": ("image_03",), "moving_classes": ()}
+    chosen: dict[str, Any] = {"first": 7, "frames": 3, "cameras": ()}
     chosen |= {"raw_lidar": True, "ego_mask": Path("masks"), "theta_max_deg": 92.5}
     options = Kitti360Options(output=Path("scenes/000"), root=tmp_path, sequence=SEQUENCE, **chosen)
     _, module, ends_with_parent, *words = own_command(("process", "kitti360"), options)

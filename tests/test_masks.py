@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask, write_png
-from edge_depth_nerf.cameras import Pinhole, camera_from_dict
-from edge_depth_nerf.masks import ego, lens, semantics, sky
+from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, read_mask
+from edge_depth_nerf.cameras import MEI, Pinhole
+from edge_depth_nerf.masks import ego, lens, sky
 from edge_depth_nerf.process.kitti360.calibration import read_cam_to_pose, read_mei_camera
 
 SIZE = 240
@@ -266,57 +265,6 @@ def test_pictures_of_a_long_drive_are_thinned_out() -> None:
     assert loaded[-1] > 290, "the end of the drive was looked at as well"
 
 
-# ---- semantics -------------------------------------------------------------------------------------------------
-def test_moving_things_are_hidden_with_a_margin(tmp_path: Path) -> None:
-    # by kitti360Scripts: 26 car, 24 person, 23 sky, 7 road
-    labels = np.full((400, 400), 7, np.uint8)
-    labels[:50] = 23
-    labels[200:220, 100:140] = 26
-    labels[300, 300] = 24
-    path = semantics.label_path(tmp_path, "2013_05_28_drive_0000_sync", "image_02", 7)
-    assert path == tmp_path / ("data_2d_semantics/train/2013_05_28_drive_0000_sync/image_02/semantic/0000000007.png")
-    write_png(path, labels)
-    read = semantics.read_labels(path)
-    assert np.array_equal(read, labels)
-    y, x = np.mgrid[:400, :400]
-    margin = round(400 * semantics.MARGIN)
-    off = np.hypot(np.maximum(np.maximum(100 - x, x - 139), 0), np.maximum(np.maximum(200 - y, y - 219), 0))
-    keep = semantics.keep_static(read, ("car", "person"))
-    assert not keep[off <= margin].any()
-    assert not keep[300, 300]
-    # a disc of pixels is a little more than round
-    assert keep[(off > margin + 1) & (np.hypot(x - 300, y - 300) > margin + 1)].all()
-    assert semantics.keep_static(read, ["car"])[300, 300]
-    assert semantics.keep_static(read, ()).all()
-    assert np.array_equal(semantics.sky(read), y < 50)
-
-
-def test_classes_have_kitti360s_ids() -> None:
-    # some of each part of the data set's table
-    known = {"unlabeled": 0, "dynamic": 5, "road": 7, "tunnel": 16, "vegetation": 21, "sky": 23, "person": 24}
-    known |= {"car": 26, "trailer": 30, "bicycle": 33, "garage": 34, "unknown vehicle": 43, "unknown object": 44}
-    assert semantics.check_classes(known) == list(known.values())
-    assert len(semantics.CLASSES) == len(set(semantics.CLASSES)) == 45
-
-
-def test_labels_that_cannot_be_used(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"'tram'.*car, truck, bus"):
-        semantics.keep_static(np.zeros((4, 4), np.uint8), ["car", "tram"])
-    path = tmp_path / "labels.png"
-    with pytest.raises(FileNotFoundError, match=r"labels\.png"):
-        semantics.read_labels(path)
-    write_png(path, np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(InputError, match=r"labels.png.*8-bit RGB.*semantic_rgb"):
-        semantics.read_labels(path)
-    write_png(path, np.full((4, 4), 99, np.uint8))
-    with pytest.raises(InputError, match=r"labels.png.*holds 99"):
-        semantics.read_labels(path)
-    write_png(path, np.full((64, 64), 26, np.uint8))
-    path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(InputError, match=r"labels.png.*truncated"):
-        semantics.read_labels(path)
-
-
 # ---- sky -------------------------------------------------------------------------------------------------------
 FOCAL_PX = 100.0
 CAMERA = Pinhole(SIZE, SIZE, FOCAL_PX, FOCAL_PX, SIZE / 2, SIZE / 2)
@@ -404,7 +352,9 @@ def test_incomplete_blocks_of_large_pictures() -> None:
 def test_masks_of_the_sample_drive(sample_drive: Path, name: str) -> None:
     meta = read_json(sample_drive / "transforms.json")
     frames = [frame for frame in meta["frames"] if frame["camera"] == name]
-    camera = camera_from_dict(meta["original_cameras"][name], "the sample drive")
+    parameters = meta["original_cameras"][name]
+    assert parameters.pop("model") == "MEI"
+    camera = MEI(**parameters)
     circle, used = lens.lens_circle(camera, meta["theta_max_deg"]), read_mask(sample_drive / f"masks/{name}.png")
     rim = lens.dark_rim(read_image(sample_drive / frame["file_path"]) for frame in frames[::4])
     assert rim is not None

@@ -30,8 +30,6 @@ from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import project_points, transform_points
 from edge_depth_nerf.masks.lens import lens_circle
-from edge_depth_nerf.masks.semantics import check_classes, keep_static, read_labels
-from edge_depth_nerf.masks.semantics import sky as sky_of_labels
 from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.process.found_path import with_all_cameras
 from edge_depth_nerf.process.held_out import check_holdout_cameras, is_held_out, of_training_cameras
@@ -90,7 +88,6 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     """
     console = console or Console()
     options.check()
-    check_classes(options.moving_classes)
     recording = with_given_masks(recording, options)
     check_holdout_cameras(recording, options)
     _check_poses(recording, options)
@@ -300,7 +297,7 @@ class _Builder:
         self._without: list[str] = []
         pictures = recording.pictures
         present = {
-            "mask": any(picture.mask or picture.moving_mask or picture.semantics for picture in pictures),
+            "mask": any(picture.mask or picture.moving_mask for picture in pictures),
             "lidar": bool(recording.sweeps) or any(picture.depth for picture in pictures),
             "mono": any(picture.mono for picture in pictures),
             "beams": bool(recording.sweeps) and options.holdout_beams > 0,
@@ -330,10 +327,9 @@ class _Builder:
         factor = self._options.downscale
         camera = self._cameras[picture.camera].camera
         image = downscale_image(read_image(picture.path), factor)
-        labels = None if picture.semantics is None else read_labels(picture.semantics)
-        mask = self._mask(picture, labels, camera)
+        mask = self._mask(picture, camera)
         lidar, cloud = self._lidar(picture, camera, image)
-        mono = None if picture.mono is None else self._mono(picture, camera, image, labels, lidar)
+        mono = None if picture.mono is None else self._mono(picture, camera, image, lidar)
         return FrameContent(
             image=picture.path if factor == 1 else image,
             mask=None if mask is None else downscale_mask(mask, factor),
@@ -348,9 +344,7 @@ class _Builder:
     def _is_held_out(self, picture: RecordedPicture) -> bool:
         return is_held_out(picture, self._held_out, self._options)
 
-    def _mask(
-        self, picture: RecordedPicture, labels: UInt8[np.ndarray, "h w"] | None, camera: Camera
-    ) -> NDArray[np.bool_] | None:
+    def _mask(self, picture: RecordedPicture, camera: Camera) -> NDArray[np.bool_] | None:
         """What of the picture holds still, as far as that is given."""
         if "mask" not in self.layers:
             return None
@@ -359,8 +353,6 @@ class _Builder:
             mask &= read_camera_mask(picture.mask, camera)
         if picture.moving_mask is not None:
             mask &= read_camera_mask(picture.moving_mask, camera)
-        if labels is not None:
-            mask &= keep_static(labels, self._options.moving_classes)
         return mask
 
     def _lidar(
@@ -420,7 +412,6 @@ class _Builder:
         picture: RecordedPicture,
         full: Camera,
         image: UInt8[np.ndarray, "h2 w2 3"],
-        labels: UInt8[np.ndarray, "h w"] | None,
         lidar: Float[np.ndarray, "h2 w2"] | None,
     ) -> DistanceMap:
         """The monocular map, without the sky."""
@@ -436,13 +427,9 @@ class _Builder:
         if not self._options.sky:
             return load_distance(picture.mono, factor)
         mono = downscale_distance(whole, factor)
-        if labels is not None:
-            sky = ~downscale_mask(~sky_of_labels(labels), factor)
-        else:
-            camera = full.downscaled(factor)
-            up = np.linalg.inv(self._recording.pose(picture))[:3, 2]
-            lidar = np.zeros(mono.shape, np.float32) if lidar is None else lidar
-            sky = find_sky(image, self._usable[picture.camera], up, camera, lidar, mono)
+        up = np.linalg.inv(self._recording.pose(picture))[:3, 2]
+        lidar = np.zeros(mono.shape, np.float32) if lidar is None else lidar
+        sky = find_sky(image, self._usable[picture.camera], up, full.downscaled(factor), lidar, mono)
         return np.where(sky, 0, mono).astype(np.float32)
 
     def notices(self) -> list[str]:
@@ -520,7 +507,6 @@ def _source(recording: Recording, options: ProcessOptions) -> dict[str, Any]:
         "find_ego": options.find_ego,
         "frame_masks": options.frame_masks is not None,
         **({"find_moving": True} if options.find_moving else {}),
-        "moving_classes": list(options.moving_classes),
         "mono": options.mono is not None,
         **({"mono_trained_on": "elsewhere"} if any(picture.mono for picture in recording.pictures) else {}),
         **{name: getattr(options, name) for name in ("sky", "theta_max_deg", "holdout_every")},

@@ -9,9 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.masks.lens import lens_circle
-from edge_depth_nerf.masks.semantics import keep_static, read_labels
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
@@ -39,14 +37,7 @@ class FeatureMasks:
                 shared &= read_camera_mask(recorded.ego_mask, recorded.camera)
             self._shared[recorded.name] = shared
         shared = self._shared[recorded.name]
-        own = read_if_whole(partial(self._own, picture, recorded.camera), strict=self._options.strict)
+        if picture.mask is None:
+            return shared
+        own = read_if_whole(partial(read_camera_mask, picture.mask, recorded.camera), strict=self._options.strict)
         return np.zeros_like(shared) if own is None else shared & own
-
-    def _own(self, picture: RecordedPicture, camera: Camera) -> NDArray[np.bool_]:
-        """What of one picture is not masked in it alone."""
-        mask = np.ones((camera.height, camera.width), bool)
-        if picture.mask is not None:
-            mask &= read_camera_mask(picture.mask, camera)
-        if picture.semantics is not None:
-            mask &= keep_static(read_labels(picture.semantics), self._options.moving_classes)
-        return mask

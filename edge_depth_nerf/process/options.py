@@ -58,11 +58,6 @@ class ProcessOptions:
     """Masks of all pictures: a folder with CAMERA/0000000123.png (0 = ignore the pixel), in the raw pictures' size."""
     find_moving: bool = False
     """Find moving objects by LiDAR sweeps, and mask them out. You can correct moving_masks/."""
-    moving_classes: tuple[str, ...] = (
-        *("person", "rider", "car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"),
-        "unknown vehicle",
-    )
-    """Classes to mask out if the drive has KITTI-360's semantics; none keeps all."""
     motion: bool = True
     """Find distances by comparing neighbouring pictures (docs/motion.md); this takes time."""
     mono: Path | None = None

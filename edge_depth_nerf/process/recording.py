@@ -71,8 +71,6 @@ class RecordedPicture:
     """This picture's own mask, 255 = use."""
     moving_mask: Path | None = None
     """The mask found of what moves in this picture, 255 = use; beside the given mask."""
-    semantics: Path | None = None
-    """KITTI-360's label ids, 8-bit PNG."""
     mono: Path | None = None
     """Monocular distance, 16-bit PNG of 1/256 m along the ray."""
     truth_distance: Path | None = None
@@ -83,7 +81,7 @@ class RecordedPicture:
     @property
     def inputs(self) -> tuple[Path, ...]:
         """All files there are."""
-        found = [self.path, self.mask, self.moving_mask, self.semantics, self.mono]
+        found = [self.path, self.mask, self.moving_mask, self.mono]
         found += [self.truth_distance, self.truth_rgb, None if self.depth is None else self.depth.path]
         return tuple(path for path in found if path is not None)
 

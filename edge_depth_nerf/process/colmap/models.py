@@ -266,10 +266,10 @@ class _Run:
             for c in self.recording.cameras
         ]
         pictures = [
-            [p.camera, p.frame, *(path and file_stamp(path) for path in (p.path, p.mask, p.semantics))]
+            [p.camera, p.frame, *(path and file_stamp(path) for path in (p.path, p.mask))]
             for p in self.recording.pictures
         ]
-        related = [_NEIGHBOURS, sorted(self.shared_views), self.options.moving_classes]
+        related = [_NEIGHBOURS, sorted(self.shared_views)]
         content = json.dumps([_VERSION, self.pycolmap.__version__, cameras, pictures, related])
         return hashlib.sha256(content.encode()).hexdigest()
 

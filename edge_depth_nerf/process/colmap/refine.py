@@ -177,10 +177,9 @@ def _digest(
         for c in recording.cameras
     ]
     pictures = [
-        [p.camera, p.frame, recording.pose(p).tolist(), *map(_stamp, (p.path, p.mask, p.semantics))]
-        for p in recording.pictures
+        [p.camera, p.frame, recording.pose(p).tolist(), *map(_stamp, (p.path, p.mask))] for p in recording.pictures
     ]
-    rest = [_VERSION, version, given.tolist(), options.theta_max_deg, options.moving_classes, *options.holdout_cameras]
+    rest = [_VERSION, version, given.tolist(), options.theta_max_deg, *options.holdout_cameras]
     return hashlib.sha256(json.dumps([cameras, pictures, rest]).encode()).hexdigest()
 
 

@@ -4,7 +4,6 @@ Read from the data set's folder, for each frame number f:
 
     calibration/{image_02.yaml,image_03.yaml,calib_cam_to_pose.txt,calib_cam_to_velo.txt}
     data_2d_raw/SEQUENCE/image_02/data_rgb/f.png     and image_02/timestamps.txt, if it is there
-    data_2d_semantics/train/SEQUENCE/image_02/semantic/f.png    label ids, where there are any
     data_3d_raw/SEQUENCE/velodyne_points/data/f.bin
     data_poses/SEQUENCE/poses.txt
     truth/SEQUENCE/…                                 what only synthesised drives have
@@ -30,7 +29,6 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.lidar import SweepTiming, check_sweep_size, read_sweep
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.masks.semantics import check_label_header, label_path
 from edge_depth_nerf.process.kitti360.calibration import Kitti360Rig, read_poses, read_rig, read_timestamps
 from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.process.poses import transform_of_rows
@@ -302,7 +300,6 @@ class Kitti360Drive:
         options, camera, file = self.options, rig.cameras[name], f"{frame:010d}.png"
         mask = None if options.frame_masks is None else options.frame_masks / name / file
         mono = None if options.mono is None else options.mono / name / file
-        labels = label_path(options.root, options.sequence, name, frame)
         truth_distance, truth_rgb = (
             self.truth / name / kind / file if self.has_truth else None for kind in ("distance", "rgb")
         )
@@ -323,9 +320,6 @@ class Kitti360Drive:
         for path in (mask, truth_rgb):
             if path is not None:
                 check_size(path, camera)
-        if labels.is_file():
-            check_size(labels, camera)
-            check_label_header(labels)
         for path in (mono, truth_distance):
             if path is not None:
                 check_distance(path, camera)
@@ -335,7 +329,6 @@ class Kitti360Drive:
             frame=frame,
             path=self.image_folder(name) / file,
             mask=mask,
-            semantics=labels if labels.is_file() else None,
             mono=mono,
             truth_distance=truth_distance,
             truth_rgb=truth_rgb,
