@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 import torch
 from lenses import FISHEYE, IMAGE_02, IMAGE_03, KITTI, angle, nerfstudio_directions, rays
-from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.cameras import EUCM, MEI, Camera, DoubleSphere, KannalaBrandt, OCam, Pinhole, camera_from_dict
+from edge_depth_nerf.cameras import EUCM, MEI, Camera, DoubleSphere, KannalaBrandt, OCam, Pinhole
 from edge_depth_nerf.cameras.distortion import Distortion
 
 PINHOLE = Pinhole(640, 480, 500.0, 505.0, 320.5, 239.0, -0.3, 0.1, 1e-3, -2e-3)
@@ -336,81 +335,22 @@ def test_only_the_direction_of_a_point_counts(camera: Camera) -> None:
 
 
 @each_camera
-def test_what_is_no_point_is_not_valid_and_gets_no_gradient(camera: Camera) -> None:
+def test_what_is_no_point_is_not_valid(camera: Camera) -> None:
     nan, inf = math.nan, math.inf
     bad = [[0, 0, 0], [nan, 0, 1], [0, nan, nan], [inf, 0, 1], [0, 0, inf], [0, 0, -1], [1e-30, 0, -1]]
-    points = torch.tensor([*bad, [0.0, 0.0, 1.0], [0.1, 0.1, 1.0]], requires_grad=True)
+    points = torch.tensor([*bad, [0.0, 0.0, 1.0], [0.1, 0.1, 1.0]])
     pixels, valid = camera.project(points)
     assert valid.tolist() == [False] * len(bad) + [True, True]
-    assert pixels[: len(bad)].isnan().all()
-    pixels[valid].sum().backward()
-    assert points.grad is not None
-    assert points.grad.isfinite().all()
-    assert (points.grad[: len(bad)] == 0).all()
-    assert (points.grad[len(bad) :] != 0).any(-1).all()
+    assert pixels[: len(bad)].isnan().all() and pixels[valid].isfinite().all()
 
 
 @each_camera
-def test_what_is_no_pixel_is_not_valid_and_gets_no_gradient(camera: Camera) -> None:
+def test_what_is_no_pixel_is_not_valid(camera: Camera) -> None:
     bad = [[math.nan, 3.0], [5.0, math.inf], [math.nan, math.nan], [3e38, 3e38], [-1e25, 0.0]]
-    pixels = torch.tensor([*bad, [camera.cx, camera.cy], [camera.cx + 9, camera.cy]], requires_grad=True)
+    pixels = torch.tensor([*bad, [camera.cx, camera.cy], [camera.cx + 9, camera.cy]])
     directions, valid = camera.unproject(pixels)
     assert valid.tolist() == [False] * len(bad) + [True, True]
-    directions[valid].sum().backward()
-    assert pixels.grad is not None
-    assert pixels.grad.isfinite().all()
-    assert (pixels.grad[: len(bad)] == 0).all()
-
-
-@each_camera
-def test_gradients_are_finite_all_over(camera: Camera) -> None:
-    theta = torch.linspace(0, math.pi, 181, dtype=torch.float64)
-    points = torch.cat((rays(theta), rays(camera.theta_max_rad))).float().requires_grad_()
-    pixels, valid = camera.project(points)
-    pixels[valid].sum().backward()
-    assert points.grad is not None and points.grad.isfinite().all()
-
-    rim = torch.cat((camera.pixel_centres(torch.float32)[::20, ::20].reshape(-1, 2), pixels[-1].detach()))
-    rim.requires_grad_()
-    directions, valid = camera.unproject(rim)
-    directions[valid].sum().backward()
-    assert rim.grad is not None and rim.grad.isfinite().all()
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_gradients_are_finite_on_the_rim_itself(dtype: torch.dtype) -> None:
-    # where the root of MEI's lift, or the determinant of the distortion, comes out as zero or just below
-    for step in range(40):
-        sphere = MEI(9, 9, 1.0, 1.0, 0.0, 0.0, 1.1 + 0.05 * step, 0.0, 0.0, 0.0, 0.0)
-        bent = Pinhole(9, 9, 1.0, 1.0, 0.0, 0.0, -0.1 - 0.01 * step, 0.0, 0.001 * (step % 2))
-        for camera, radius in ((sphere, sphere._radius_max), (bent, 2 / 3 * bent._radius_max)):
-            pixels = radius * torch.tensor([[1.0, 0.0], [0.0, -1.0], [0.6, 0.8]], dtype=dtype)
-            pixels.requires_grad_()
-            directions, valid = camera.unproject(pixels)
-            directions[valid].sum().backward()
-            assert pixels.grad is not None and pixels.grad.isfinite().all()
-
-
-@pytest.mark.slow
-@each_camera
-def test_derivatives_forward_reverse_and_numerical_agree(camera: Camera) -> None:
-    theta = torch.tensor([0.0, 1e-4, 0.4, 0.9], dtype=torch.float64) * camera.theta_max_rad
-    right = torch.tensor([math.pi / 2]) if camera.theta_max_rad > 1.6 else torch.tensor([])
-    points = rays(torch.cat((theta, right)), 3).reshape(-1, 3) * 3.0
-    points = torch.cat((points, torch.tensor([[0.0, 0.0, 0.5]], dtype=torch.float64)))
-    pixels = camera.project(points)[0].detach()
-    # moved alike, as none depends on another: each has its own derivatives, by a few calls
-    for function, at, eps in ((camera.project, points, 1e-7), (camera.unproject, pixels, 1e-4)):
-        moved = torch.zeros(at.shape[1], dtype=torch.float64, requires_grad=True)
-        torch.autograd.gradcheck(lambda by: function(at + by)[0], moved, eps=eps, rtol=1e-4, check_forward_ad=True)  # noqa: B023
-    # one is the inverse of the other: their derivatives, too (beside the length, which the picture loses)
-    jacobian = torch.autograd.functional.jacobian
-    unit = camera.unproject(pixels)[0].detach()
-    there = jacobian(lambda p: camera.project(p)[0].sum(0), unit)
-    back = jacobian(lambda p: camera.unproject(p)[0].sum(0), pixels)
-    assert isinstance(there, Tensor) and isinstance(back, Tensor)
-    product = torch.einsum("inj,jnk->nik", there, back)
-    torch.testing.assert_close(product, torch.eye(2, dtype=torch.float64).expand_as(product))
+    assert directions[: len(bad)].isnan().all() and directions[valid].isfinite().all()
 
 
 # -- the picture, files, errors -----------------------------------------------------------------------------
@@ -450,7 +390,8 @@ def test_downscaled_refuses_what_leaves_no_picture() -> None:
 
 @each_camera
 def test_cameras_survive_files_and_processes(camera: Camera) -> None:
-    assert camera_from_dict(json.loads(json.dumps(camera.to_dict())), "here") == camera
+    parameters = json.loads(json.dumps(camera.to_dict()))
+    assert parameters.pop("model") == camera.model and type(camera)(**parameters) == camera
     camera.project(torch.rand(4, 3))  # fills what is computed once
     copy = pickle.loads(pickle.dumps(camera))
     assert copy == camera and hash(copy) == hash(camera)
@@ -471,42 +412,17 @@ def test_no_camera_goes_beyond_what_it_was_calibrated_for(camera: Camera) -> Non
     assert limited.unproject(unlimited)[1].all(-1).tolist() == [True, True, False, False]
 
 
-def test_defaults_may_be_left_out_and_whole_numbers_may_be_given() -> None:
-    given = {"model": "PINHOLE", "width": 6, "height": 4, "fx": 5, "fy": 5, "cx": 3, "cy": 2}
-    camera = camera_from_dict(given, "here")
-    assert camera == Pinhole(6, 4, 5.0, 5.0, 3.0, 2.0)
-    assert isinstance(camera.fx, float)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"model": "FOV"}, "unknown camera model 'FOV', expected one of MEI, KANNALA_BRANDT, PINHOLE"),
-        ({"model": None}, "unknown camera model None"),
-        ({"model": ["MEI"]}, "unknown camera model"),
-        ({"xi": None}, "xi of the MEI camera is None, expected a finite number"),
-        ({"xi": True}, "xi of the MEI camera is True, expected a finite number"),
-        ({"fx": "wide"}, "fx of the MEI camera is 'wide', expected a finite number"),
-        ({"k2": math.nan}, "k2 of the MEI camera is nan, expected a finite number"),
         ({"fy": 0.0}, "fy is 0.0, expected more than 0"),
         ({"width": 0}, "width is 0, expected more than 0"),
-        ({"height": 3.5}, "height of the MEI camera is 3.5, expected a whole number"),
         ({"xi": -1.0}, "xi is -1.0, expected more than -1"),
-        ({"k5": 0.0}, "has unknown k5; expected width, height"),
     ],
 )
-def test_bad_parameters_are_named_with_their_place(change: dict, message: str) -> None:
-    with pytest.raises(InputError) as caught:
-        camera_from_dict({**IMAGE_02.to_dict(), **change}, "transforms.json, original_cameras image_02")
-    assert str(caught.value).startswith("transforms.json, original_cameras image_02: ")
-    assert message in str(caught.value)
-
-
-def test_missing_parameters_are_named() -> None:
-    parameters = IMAGE_02.to_dict()
-    del parameters["xi"], parameters["p2"]
-    with pytest.raises(InputError, match=r"here: the MEI camera lacks xi, p2; expected width, .*, p2\."):
-        camera_from_dict(parameters, "here")
+def test_bad_parameters_are_named(change: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        replace(IMAGE_02, **change)
 
 
 def test_a_limit_that_is_no_angle_is_refused() -> None:

@@ -2,7 +2,6 @@
 
 from edge_depth_nerf.cameras.fit import CameraFit, fit_kannala_brandt, host_residual
 from edge_depth_nerf.cameras.models import MEI, Camera, KannalaBrandt, Pinhole
-from edge_depth_nerf.cameras.named import camera_from_dict
 from edge_depth_nerf.cameras.wide import EUCM, DoubleSphere, OCam
 
 __all__ = [
@@ -14,7 +13,6 @@ __all__ = [
     "KannalaBrandt",
     "OCam",
     "Pinhole",
-    "camera_from_dict",
     "fit_kannala_brandt",
     "host_residual",
 ]

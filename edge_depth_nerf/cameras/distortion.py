@@ -72,8 +72,6 @@ class Distortion:
     ) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
         """Find x with F(x) = distorted, by damped Newton steps, to the precision of the type.
 
-        Differentiable (once) with respect to `distorted`, by the implicit function theorem.
-
         Args:
             distorted: finite coordinates in the distorted plane.
             radius_max: the function searches for x within |x| <= radius_max, at most this distortion's own.
@@ -83,16 +81,7 @@ class Distortion:
         Returns:
             x, and whether there is one. Where there is none, x is some point of the disc.
         """
-        with torch.no_grad():
-            target = distorted.detach().reshape(-1, 2)
-            plane, valid = self._solve(target, radius_max, tolerance.reshape(-1))
-            plane, valid = plane.reshape(distorted.shape), valid.reshape(distorted.shape[:-1])
-            inverse = self._inverse_jacobian(plane)
-        # zero in value, so that the solution stays as it is; its derivative is the inverse Jacobian
-        change = distorted - distorted.detach()
-        return plane + (inverse * change[..., None, :]).sum(-1), valid
-
-    def _solve(self, target: Tensor, radius_max: float, tolerance: Tensor) -> tuple[Tensor, Tensor]:
+        target, tolerance = distorted.reshape(-1, 2), tolerance.reshape(-1)
         eps = torch.finfo(target.dtype).eps
         length = target.norm(dim=-1, keepdim=True)
         plane = self._radial_guess(target, length, radius_max)
@@ -120,7 +109,7 @@ class Distortion:
             unsolved = residual[index].norm(dim=-1) > eps * self._magnitude(plane[index])
             index = index[unsolved & (share[index].squeeze(-1) >= _SHORTEST_STEP)]
         valid = residual.norm(dim=-1) <= _ROUNDING * eps * self._magnitude(plane) + tolerance
-        return plane, valid
+        return plane.reshape(distorted.shape), valid.reshape(distorted.shape[:-1])
 
     def _radial_guess(self, target: Tensor, length: Tensor, radius_max: float) -> Tensor:
         """The solution for p = 0, from a table; close to a fold Newton's steps from elsewhere go astray."""
@@ -189,7 +178,7 @@ class Distortion:
 
     def _inverse_jacobian(self, plane: Tensor) -> Tensor:
         xx, yy, xy = self._jacobian(plane)
-        # at the rim the determinant may be zero; a finite inverse there keeps steps and gradients finite
+        # at the rim the determinant may be zero; a finite inverse there keeps steps finite
         determinant = (xx * yy - xy * xy).clamp_min(torch.finfo(plane.dtype).eps)
         rows = torch.stack((torch.stack((yy, -xy), -1), torch.stack((-xy, xx), -1)), -2)
         return rows / determinant[..., None, None]

@@ -99,19 +99,15 @@ class Camera(ABC):
 
         A point at the origin, or with a coordinate that is not finite, is not valid.
         """
-        with torch.no_grad():
-            largest = points.abs().amax(-1, keepdim=True)
-            usable = (largest > 0) & torch.isfinite(largest)
-        # Points that cannot be used are replaced before the arithmetic, not after it: a NaN that is merely
-        # discarded by `where` would still come back as the gradient. Division by the largest coordinate keeps
-        # squares from overflow; the result does not depend on it, so it may be left out of the gradient.
+        largest = points.abs().amax(-1, keepdim=True)
+        usable = (largest > 0) & torch.isfinite(largest)
         forward = points.new_tensor([0.0, 0.0, 1.0])
+        # division by the largest coordinate keeps squares from overflow
         rays = torch.where(usable, points, forward) / torch.where(usable, largest, 1.0)
-        with torch.no_grad():
-            theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
-            # a ray of the rim itself may come out a rounding beyond it
-            limit = self.theta_max_rad * (1.0 + 8.0 * torch.finfo(points.dtype).eps)
-            usable = usable & (theta <= limit)[..., None]
+        theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
+        # a ray of the rim itself may come out a rounding beyond it
+        limit = self.theta_max_rad * (1.0 + 8.0 * torch.finfo(points.dtype).eps)
+        usable = usable & (theta <= limit)[..., None]
         plane, defined = self._to_plane(torch.where(usable, rays, forward))
         pixels = self._distortion.distort(plane) * plane.new_tensor([self.fx, self.fy])
         pixels = pixels + plane.new_tensor([self.cx, self.cy])
@@ -124,12 +120,10 @@ class Camera(ABC):
         Second, whether the pixel is the image of a ray with θ <= `theta_max_rad`.
         """
         focal, principal = pixels.new_tensor([self.fx, self.fy]), pixels.new_tensor([self.cx, self.cy])
-        with torch.no_grad():
-            usable = torch.isfinite(((pixels - principal) / focal).square().sum(-1))
+        usable = torch.isfinite(((pixels - principal) / focal).square().sum(-1))
         pixels = torch.where(usable[..., None], pixels, principal)
         distorted = (pixels - principal) / focal
-        with torch.no_grad():
-            rounding = torch.finfo(pixels.dtype).eps * ((pixels.abs() + principal.abs()) / focal).amax(-1)
+        rounding = torch.finfo(pixels.dtype).eps * ((pixels.abs() + principal.abs()) / focal).amax(-1)
         plane, solved = self._distortion.undistort(distorted, self._radius_max, rounding)
         valid = usable & solved
         directions = self._from_plane(torch.where(valid[..., None], plane, 0.0))
@@ -169,7 +163,7 @@ class Camera(ABC):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """All parameters under their names, and "model"; `named.camera_from_dict` reads it back."""
+        """All parameters under their names, and "model"."""
         return {"model": self.model, **dataclasses.asdict(self)}
 
 

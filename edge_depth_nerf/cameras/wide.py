@@ -21,7 +21,7 @@ from edge_depth_nerf.cameras.distortion import Distortion, first_positive_root
 from edge_depth_nerf.cameras.models import MEI, Camera
 
 _TABLE_SIZE = 4096
-_NEWTON_STEPS = 6
+_NEWTON_STEPS = 7
 _BEYOND_CORNER = 1.5
 """A polynomial is used up to so many times the distance of the picture's farthest corner: it was fitted within."""
 
@@ -201,38 +201,28 @@ class OCam(Camera):
         square = (points[..., :2] * points[..., :2]).sum(-1, keepdim=True)
         on_axis = square == 0
         across = torch.where(on_axis, 1.0, square).sqrt()
-        with torch.no_grad():
-            theta = torch.atan2(across, z)
-            rho = torch.from_numpy(np.interp(theta.double().cpu().numpy(), *self._table)).to(points)
-            for _ in range(_NEWTON_STEPS):
-                value, slope = self._z(rho)
-                rho = (rho - (rho * z - across * value) / self._rise(z - across * slope)).clamp(0.0, self._reach)
+        theta, smallest = torch.atan2(across, z), torch.finfo(z.dtype).eps
+        rho = torch.from_numpy(np.interp(theta.double().cpu().numpy(), *self._table)).to(points)
+        for _ in range(_NEWTON_STEPS):
             value, slope = self._z(rho)
-        # zero in value; its derivative is that of the solution
-        rho = rho - (rho * z - across * value) / self._rise(z - across * slope)
+            # its derivative is positive up to the rim
+            rise = (z - across * slope).clamp_min(smallest)
+            rho = (rho - (rho * z - across * value) / rise).clamp(0.0, self._reach)
         factor = torch.where(on_axis, 1.0 / torch.where(on_axis & (z > 0), z, 1.0), rho / across)
         x, y = (factor * points[..., :2]).unbind(-1)
         plane = torch.stack((x + self.shear_x * y, y + self.shear_y * x), -1)
         return plane, ~(on_axis & (z <= 0)).squeeze(-1)
 
-    @staticmethod
-    def _rise(value: Tensor) -> Tensor:
-        """Keep a derivative, which is positive up to the rim, from zero."""
-        return value.detach().clamp_min(torch.finfo(value.dtype).eps)
-
     def _from_plane(self, plane: Tensor) -> Tensor:
         x, y = plane.unbind(-1)
         level = torch.stack((x - self.shear_x * y, y - self.shear_y * x), -1) / (1.0 - self.shear_x * self.shear_y)
-        square = (level * level).sum(-1, keepdim=True)
-        on_axis = square == 0
-        rho = torch.where(on_axis, 0.0, torch.where(on_axis, 1.0, square).sqrt())
+        rho = (level * level).sum(-1, keepdim=True).sqrt()
         rays = torch.cat((level, self._z(rho)[0]), -1)
         return rays / rays.norm(dim=-1, keepdim=True)
 
     def unproject(self, pixels: Float[Tensor, "*batch 2"]) -> tuple[Float[Tensor, "*batch 3"], Bool[Tensor, "*batch"]]:
         """Find the rays of pixels, as `Camera.unproject`; the sheared disc's rim is taken by the angle."""
         rays, valid = super().unproject(pixels)
-        with torch.no_grad():
-            theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
-            valid = valid & (theta <= self.theta_max_rad * (1.0 + 8.0 * torch.finfo(pixels.dtype).eps))
+        theta = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])
+        valid = valid & (theta <= self.theta_max_rad * (1.0 + 8.0 * torch.finfo(pixels.dtype).eps))
         return torch.where(valid[..., None], rays, math.nan), valid
