@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from data_sets import beams
-from drives import synthesize_coarsely
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
@@ -29,6 +28,7 @@ from edge_depth_nerf.process.moving import MOVING_MASKS, find_moving, moving_mas
 from edge_depth_nerf.process.options import RigOptions
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.vehicle import vehicle_masks
+from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
 GROUND_M, WALL_M = -1.7, 30.0
@@ -207,7 +207,7 @@ def test_a_roof_above_the_field_is_where_the_picture_has_an_edge() -> None:
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("traffic") / "drive"
     made = SynthesizeOptions(root, "traffic", frames=14, size=128, layout="rig", seed=1)
-    return synthesize_coarsely(made)
+    return synthesize_drive(made)
 
 
 def options(root: Path, output: Path, **more: object) -> RigOptions:
