@@ -270,7 +270,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 
 def test_a_command_line_gives_the_options_back(tmp_path: Path) -> None:
-    chosen: dict[str, Any] = {"first": 7, "frames": 3, "cameras": ()}
+    chosen: dict[str, Any] = {"first": 7, "frames": 3, "cameras": (), "holdout_cameras": ("image_03",)}
     chosen |= {"raw_lidar": True, "ego_mask": Path("masks"), "theta_max_deg": 92.5}
     options = Kitti360Options(output=Path("scenes/000"), root=tmp_path, sequence=SEQUENCE, **chosen)
     _, module, ends_with_parent, *words = own_command(("process", "kitti360"), options)
