@@ -91,6 +91,22 @@ def test_a_field(appearance, dtype):
         assert all(map(torch.equal, products.field(encoded, of_rays, RUNS, first, second, 3, dtype), (before, colours)))
 
 
+@pytest.mark.parametrize("density", [-1e6, 1e6])
+def test_a_density_beyond_half_precision_spoils_no_colour(density):
+    """Of space that stays empty, or full, a long training makes it ever larger."""
+    torch.manual_seed(0)
+    first, second = scaled(*WIDTHS["first"]), scaled(*WIDTHS["second"])
+    encoded, of_rays = torch.randn(370, 8, requires_grad=True), torch.randn(130, 3)
+    found = []
+    for bias in (0.0, density):
+        with torch.no_grad():
+            first[1][-1][0] = bias
+        before, colours = products.field(encoded, of_rays, RUNS, first, second, 3, torch.float16)
+        found.append((before, colours, *torch.autograd.grad(colours.sum(), [*second[0], encoded])))
+    assert before.isinf().all()
+    assert found[0][1].isfinite().all() and all(map(torch.equal, found[0][1:], found[1][1:]))
+
+
 def test_there_is_no_second_derivative():
     weights, biases = layers(4, 3, 2)
     x = torch.randn(5, 4, requires_grad=True)

@@ -125,11 +125,12 @@ class _Field(torch.autograd.Function):
         weights, biases = made[: len(made) // 2], made[len(made) // 2 :]
         *entering, features = _forward(encoded.detach().to(dtype), weights[:count], biases[:count], follow)
         rows = weights[count]
-        # the density is no input of the second network: it has the weight 0
+        # the density is no input of the second network: 0, with the weight 0, as infinity times 0 would be none
         weights[count] = torch.cat([rows[:, :directions], rows.new_zeros(len(rows), 1), rows[:, directions:]], 1)
         own = slice(directions, directions + features.shape[1])
         points = features.new_empty(len(features), weights[count].shape[1])
-        points[:, own].copy_(features)
+        points[:, directions].zero_()
+        points[:, directions + 1 : own.stop].copy_(features[:, 1:])
         for of_points, of_run in _by_run(runs, points, of_rays.detach()):
             of_points[..., :directions].copy_(of_run[..., :directions])
             if own.stop < points.shape[1]:
@@ -141,7 +142,7 @@ class _Field(torch.autograd.Function):
             ctx.counts = len(parameters), len(entering)
             ctx.save_for_backward(encoded, of_rays, colours, *parameters, *entering, *behind)
         rays_first, each = runs[0]
-        return features[: rays_first * each, 0].clone(), colours
+        return features[: rays_first * each, 0], colours
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
