@@ -136,7 +136,8 @@ def started(settings: Settings) -> Found:
 
     config = configuration(settings)
     about: Found = {**machine(), "triton": triton.__version__, "cuda": torch.version.cuda}
-    about["caches before"] = "filled" if settings.caches.exists() else "empty"
+    # Numba's is made by imports
+    about["caches before"] = "filled" if (settings.caches / "scene").exists() else "empty"
     ready = time.time()
     runner = Runner(config, settings.folder / "started")
     set_up, steps_s = time.time(), []
@@ -523,12 +524,12 @@ METHODS = {
 }
 """Methods of `compare`, and seeds: the rivals have no extras, as they were published."""
 PARTS = {
-    "recording": Part(started, 60),
-    "steps": Part(steps, 60),
+    "recording": Part(started, 50),
+    "steps": Part(steps, 90),
     "profile": Part(profile, 40),
-    "start": Part(started, 40),
+    "start": Part(started, 35),
     "kernels": Part(kernels, 60),
-    **{name: Part(partial(trained, method=m, seed=s), 150, TRAININGS) for name, (m, s) in METHODS.items()},
+    **{name: Part(partial(trained, method=m, seed=s), 130, TRAININGS) for name, (m, s) in METHODS.items()},
     SPLATS: Part(splats, 470),
     "tests": Part(gpu_tests, 60, "checks"),
     "counts": Part(counts, 60, "checks"),
