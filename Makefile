@@ -25,14 +25,18 @@ help:
 PACKAGES_GB := 9.7
 TEMPORARY_GB := 3.6
 
-# OpenCV comes in several wheels that overwrite each other; the one with contrib and without a window goes last. Bytecode
-# of all packages would take two minutes; Python makes that of what is imported.
+# uv takes a minute where pip takes five. It does not read pip's settings: where it gets nothing, pip installs. OpenCV comes
+# in several wheels that overwrite each other; the one with contrib and without a window goes last. Bytecode of all
+# packages would take two minutes; Python makes that of what is imported.
+PIP = $(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) .ci/enough_space.py $(VENV) $(PACKAGES_GB) $(TEMPORARY_GB)
-	@echo "Installing into $(VENV): some minutes, 9 GB. pip prints nothing while it works, except warnings of other packages."
+	@echo "Installing into $(VENV): a minute with uv, some with pip, which prints nothing while it works; 9 GB."
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt --no-deps --force-reinstall opencv-contrib-python-headless
+	$(PIP) uv
+	$(BIN)/uv pip install --cache-dir $(VENV)/.uv --python $(BIN)/python -c constraints.txt -e '.[dev]' || $(PIP) -e '.[dev]'
+	rm -rf $(VENV)/.uv
+	$(PIP) --no-deps --force-reinstall opencv-contrib-python-headless
 	touch $@
 
 setup: $(VENV)/.installed
