@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -85,3 +87,8 @@ def test_on_a_gpu_several_losses_that_are_not_finite_end_a_training(shared, caps
         counted(pipeline, (*range(101, 107), 150), set(range(101, 107)))
     with pytest.raises(NotFiniteError, match=r"rgb_loss is nan.*pictures: .*\.png.*In 6 of the last 50"):
         counted(pipeline, (*range(195, 200), 200), set(range(195, 201)))
+    with torch.no_grad():
+        next(pipeline.model.proposal_networks.parameters()).view(-1)[0] = math.nan
+    # no picture is to blame
+    with pytest.raises(NotFiniteError, match=r"is nan, as the parameter proposal_networks\.0\S* is not finite"):
+        counted(pipeline, (*range(245, 250), 250), set(range(245, 251)))

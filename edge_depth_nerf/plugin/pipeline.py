@@ -185,12 +185,22 @@ class EdgeDepthPipeline(VanillaPipeline):
                 "them."
             )
 
+    def broken_parameter(self) -> str | None:
+        """Name the first parameter that has a number that is not finite; None where there is none."""
+        # a sum is not finite if one of its terms is not
+        sums = ((name, each.detach().sum(dtype=torch.float64)) for name, each in self.model.named_parameters())
+        return next((name for name, total in sums if not torch.isfinite(total)), None)
+
     def _not_finite(self, step: int, outputs: dict[str, Any], losses: dict[str, Any]) -> str:
-        """Say which losses are not finite, and in which pictures."""
+        """Say which losses are not finite, and in which pictures, or by which parameter."""
         manager = self.datamanager
         odd = [
             f"{name} is {value}" for name, loss in losses.items() if not math.isfinite(value := float(loss.detach()))
         ]
+        if (name := self.broken_parameter()) is not None:
+            return (
+                f"Step {step}: {', '.join(odd)}, as the parameter {name} is not finite, which an earlier step made it."
+            )
         count = len(manager.trained_on)
         rendered = [outputs["rgb"], *(weights.flatten(1) for weights in outputs.get("weights_list", ()))]
         bad = ~torch.cat([torch.isfinite(values) for values in rendered], dim=-1).all(-1)

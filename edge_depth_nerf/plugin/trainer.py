@@ -242,12 +242,11 @@ class EdgeDepthTrainer(Trainer):
         Raises:
             InputError: a parameter is not finite, or the file cannot be written. The checkpoint before is kept.
         """
-        for name, parameter in self.pipeline.model.named_parameters():
-            # a sum is not finite if one of its terms is not
-            if not torch.isfinite(parameter.detach().sum(dtype=torch.float64)):
-                raise InputError(
-                    f"The parameter {name} is not finite after step {step}, because a gradient was not. {self._kept()}"
-                )
+        pipeline: Any = self.pipeline
+        if (name := pipeline.broken_parameter()) is not None:
+            raise InputError(
+                f"The parameter {name} is not finite after step {step}, because a gradient was not. {self._kept()}"
+            )
         with self._interruption.put_off():
             self._save_whole(step)
 
