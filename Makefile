@@ -16,7 +16,7 @@ help:
 	@echo "make coverage    all tests, and which lines and branches they run"
 	@echo "make fuzz        a thousand spoilt files for every reader, then a coverage-guided fuzzer (half an hour)"
 	@echo "make audit       known faults of the installed packages (asks the network)"
-	@echo "make lint        ruff, import-linter, the prose rules and pyright"
+	@echo "make lint        ruff, import-linter, the prose rules and pyrefly"
 	@echo "make docs        the pages as a site (site/)"
 	@echo "make check-dist  build wheel and sdist (dist/), install them into a fresh environment"
 	@echo "make setup       the virtual environment in $(VENV), with the versions of constraints.txt"
@@ -102,7 +102,7 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python docs/check_prose.py
-	$(BIN)/pyright --threads 2
+	$(BIN)/pyrefly check
 
 format: setup
 	$(BIN)/ruff check --fix .

@@ -176,7 +176,7 @@ def is_union_of_commands(hint: Any) -> bool:
 def option_rows(cls: type, declared_by: type) -> list[tuple[str, ...]]:
     """The options of a command that one of its dataclasses declares."""
     docs, hints = field_docs(declared_by), get_type_hints(cls, include_extras=True)
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for entry in dataclasses.fields(cls):
         if entry.name not in docs or is_marked(hints[entry.name], tyro.conf.Suppress):
             continue

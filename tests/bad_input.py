@@ -136,7 +136,7 @@ def npy(array: np.ndarray) -> bytes:
 
 def npz(**arrays: np.ndarray) -> bytes:
     file = io.BytesIO()
-    np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
+    np.savez_compressed(file, **arrays)  # pyrefly: ignore
     return file.getvalue()
 
 

@@ -108,6 +108,6 @@ def write_rendered(scene: Path, folder: Path, gain: float) -> None:
     write_json(folder / BY_VIEW, {"0": {"masked_psnr": 30 * gain, "lidar_delta_1_25": gain}})
 
 
-def options(*scenes, **changes):
+def options(*scenes, **changes: Any):
     """Options of a comparison that writes nowhere unless `output` is given."""
-    return CompareOptions(scenes=tuple(scenes), **{"output": Path("/nonexistent/out"), **changes})
+    return CompareOptions(scenes=tuple(scenes), **dict[str, Any](output=Path("/nonexistent/out")) | changes)

@@ -40,14 +40,14 @@ if (3, 11) <= sys.version_info < (3, 11, 8):
 if Version(version("jaxtyping")) < Version("0.3.11"):
     for finder in sys.meta_path:
         if type(finder).__module__ == "jaxtyping._import_hook":
-            finder.modules = [each for each in finder.modules if each != "edge_depth_nerf.kernels"]  # pyright: ignore
+            finder.modules = [each for each in finder.modules if each != "edge_depth_nerf.kernels"]  # pyrefly: ignore
 
 ARRAYS = re.compile(r"\b(Bool|Float|Int|Shaped|UInt)\d*\[")
 with_shapes = jaxtyping.jaxtyped
 
 
 def jaxtyped(checked: Any = None, *, typechecker: Any) -> Any:
-    """Check calls of what has arrays in its signature: jaxtyping's checks are slow, and pyright knows other types."""
+    """Check calls of what has arrays in its signature: jaxtyping's checks are slow, and pyrefly knows other types."""
     if checked is None:
         return lambda function: jaxtyped(function, typechecker=typechecker)
     if isinstance(checked, type) or ARRAYS.search(str(getattr(checked, "__annotations__", ""))):
@@ -55,7 +55,7 @@ def jaxtyped(checked: Any = None, *, typechecker: Any) -> Any:
     return checked
 
 
-jaxtyping.jaxtyped = jaxtyped
+jaxtyping.jaxtyped = jaxtyped  # pyrefly: ignore
 
 HOST = "nerfstudio"
 LARGE_BYTES = 2 << 20
@@ -87,7 +87,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--fast"):
-        sys.meta_path.insert(0, SkipWhatImportsTheHost())  # pyright: ignore[reportArgumentType]
+        sys.meta_path.insert(0, SkipWhatImportsTheHost())
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -221,8 +221,8 @@ def nuscenes(root: Path) -> Path:
 
 def argoverse2(root: Path) -> Path:
     """Write a log; give its folder."""
-    import pyarrow  # pyright: ignore[reportMissingImports]
-    from pyarrow import feather  # pyright: ignore[reportMissingImports]
+    import pyarrow  # pyrefly: ignore
+    from pyarrow import feather  # pyrefly: ignore
 
     def write(path: Path, **columns: Any) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)

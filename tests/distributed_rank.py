@@ -52,7 +52,7 @@ def main() -> None:
     dist.init_process_group("gloo", init_method=store, rank=rank, world_size=world_size, timeout=timedelta(seconds=120))
     base_pipeline.DDP = OnCpu
     barrier = dist.barrier
-    dist.barrier = lambda device_ids=None: barrier()
+    dist.barrier = lambda device_ids=None: barrier()  # pyrefly: ignore
     made: dict[str, int] = {}
     counted(datamanager, "write_table", made)
     counted(ray_table, "_make", made)

@@ -12,10 +12,10 @@ import time
 import warnings
 from pathlib import Path
 
-import atheris  # pyright: ignore[reportMissingImports]
+import atheris  # pyrefly: ignore
 
 SEEN = ["edge_depth_nerf.process", "edge_depth_nerf.base.bounds", "edge_depth_nerf.base.files"]
-with atheris.instrument_imports(include=SEEN):  # pyright: ignore[reportAttributeAccessIssue]
+with atheris.instrument_imports(include=SEEN):  # pyrefly: ignore
     from bad_input import OURS
 
 from edge_depth_nerf.base.errors import InputError  # noqa: E402 (what is instrumented comes first)

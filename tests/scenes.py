@@ -50,7 +50,7 @@ def view(camera: Camera, camera_to_world: np.ndarray) -> tuple[np.ndarray, np.nd
     rays = torch.nan_to_num(directions).numpy() @ camera_to_world[:3, :3].T
     origin = camera_to_world[:3, 3]
     along = rays @ origin
-    distance = -along + np.sqrt(along**2 + RADIUS_M**2 - origin @ origin)
+    distance = -along + np.sqrt(along**2 + RADIUS_M**2 - origin @ origin)  # pyrefly: ignore[unsupported-operation]
     wall = (origin + distance[..., None] * rays) / RADIUS_M
     colours = 127 + 120 * np.sin(wall * np.array([3.0, 4.0, 5.0]) + np.array([0.0, 1.0, 2.0]))
     known = valid.numpy()

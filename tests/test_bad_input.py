@@ -41,7 +41,7 @@ fuzzed = settings(
     derandomize=INPUTS <= 100,
     database=None,
     phases=[Phase.explicit, Phase.generate],
-    suppress_health_check=list(HealthCheck),  # pyright: ignore[reportArgumentType]
+    suppress_health_check=list(HealthCheck),
 )
 
 

@@ -532,7 +532,7 @@ def test_clouds_with_rows_and_big_numbers() -> None:
     """Organised, big-endian, rows padded, intensity of another name and type."""
     names, formats = ["x", "y", "z", "reflectivity"], [">f8", ">f8", ">f8", ">u2"]
     record = {"names": names, "formats": formats, "offsets": [0, 8, 16, 26], "itemsize": 32}
-    table = np.zeros((3, 5), np.dtype(record))  # pyright: ignore[reportArgumentType, reportCallIssue]
+    table = np.zeros((3, 5), np.dtype(record))
     table["x"] = np.arange(15).reshape(3, 5) + 1
     table["reflectivity"] = 300
     rows = np.pad(table.view(np.uint8).reshape(3, 160), ((0, 0), (0, 8)))

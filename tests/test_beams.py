@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,8 +48,8 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
     found = {}
     for beams in (0, 10):
         found[beams] = folder / f"scene_{beams}"
-        given = {"root": room.root, "sequence": SEQUENCE, "cameras": ("image_02",), "output": found[beams]}
-        given |= {"sweeps": 1, "find_ego": False, "refine_poses": False, "holdout_beams": beams}
+        given: dict[str, Any] = {"root": room.root, "sequence": SEQUENCE, "cameras": ("image_02",), "sweeps": 1}
+        given |= {"output": found[beams], "find_ego": False, "refine_poses": False, "holdout_beams": beams}
         convert(Kitti360Options(**given), Console(quiet=True))
     return found
 

@@ -205,7 +205,8 @@ def trained(scene, tmp_path_factory):
         "host": (theirs, NerfstudioDataParserConfig(downscale_factor=1, center_method="focus")),
     }
     for name, (config, parser) in parsers.items():
-        datamanager = replace(config.pipeline.datamanager, dataparser=parser, data=scene)  # pyright: ignore
+        datamanager = replace(config.pipeline.datamanager, dataparser=parser, data=scene)  # pyrefly: ignore
+        # pyrefly: ignore[missing-attribute, unexpected-keyword]
         settings = replace(config, data=scene, pipeline=replace(config.pipeline, datamanager=datamanager))
         (folder / f"{name}.yml").write_text(yaml.dump(settings))
         parser.data = scene

@@ -460,7 +460,7 @@ def test_poses_of_a_drive_are_metric_and_right(drive, found):
     to_vehicle = {camera.name: camera.to_vehicle for camera in recording.cameras}
     true = np.stack([truth[p.frame] @ to_vehicle[p.camera] for p in recording.pictures])
     poses = np.stack([p.camera_to_world for p in recording.pictures])
-    path_m = sum(np.linalg.norm(truth[f + 1][:3, 3] - truth[f][:3, 3]) for f in range(FRAMES - 2))
+    path_m = sum(np.linalg.norm(truth[f + 1][:3, 3] - truth[f][:3, 3]) for f in range(FRAMES - 2))  # pyrefly: ignore
     factor, error_m = umeyama(poses[:, :3, 3], true[:, :3, 3])
     assert error_m.max() < 0.005 * path_m
     assert abs(1 / factor - 1) < 0.01
@@ -608,7 +608,7 @@ def test_a_model_of_two_pictures_is_not_the_end(drive, tmp_path, monkeypatch):
         found = colmap_poses(*five_frames(drive, tmp_path / str(number), 1), QUIET)
         assert found.trajectory is not None
         paths.append(found.trajectory.vehicle_to_world)
-    np.testing.assert_array_equal(*paths)
+    np.testing.assert_array_equal(*paths)  # pyrefly: ignore[bad-argument-type]
     # such a model alone says so, and not that LiDAR saw nothing
     monkeypatch.setattr(colmap_models, "_POSE_POINTS", (10_000,))
     with pytest.raises(InputError, match="COLMAP found no poses for the 10 pictures"):

@@ -125,12 +125,13 @@ def test_a_folder_keeps_what_its_runs_share(tmp_path, monkeypatch, begin):
         f"{begun} edge --steps 5",
         f"{begun} nerfacto --steps 5 --seeds 0 1",
     ]
+    change: dict[str, Any]
     for change, message in (
         ({"preset": "full"}, "preset lite, not full"),
         ({"detail": True}, "detail False, not True"),
     ):
         with pytest.raises(InputError, match=message):
-            command.compare(replace(first, **change), QUIET)
+            command.compare(replace(first, **change), QUIET)  # pyrefly: ignore[bad-argument-type]
     distances = sorted((scene / "mono").iterdir())[0]
     before = distances.read_bytes()
     write_distance_png(distances, read_distance_png(distances) * 1.1)  # maps of another network under the same names

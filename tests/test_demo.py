@@ -7,6 +7,7 @@ import subprocess
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -205,9 +206,10 @@ def test_other_options_need_another_folder_and_are_checked_before_anything_start
     with pytest.raises(InputError, match="other options"):
         demo.run_demo(replace(finished[0], steps=9), QUIET)
     output = tmp_path / "out"
+    changes: dict[str, Any]
     for changes, message in (({"steps": 0}, "--steps 0"), ({"frames": 0}, "--frames 0")):
         with pytest.raises(InputError, match=message):
-            demo.run_demo(replace(DemoOptions(output=output), **changes), QUIET)
+            demo.run_demo(replace(DemoOptions(output=output), **changes), QUIET)  # pyrefly: ignore[bad-argument-type]
     assert not output.exists()
 
 

@@ -189,7 +189,7 @@ def errors(pipeline, number: int = 0) -> tuple[float, float]:
 
 @pytest.mark.parametrize("lenses", LENSES)
 def test_a_grey_model_shows_the_colours_of_its_training_pictures(tmp_path, monkeypatch, lenses):
-    pipeline = pipeline_of(write_scene(tmp_path, LENSES[lenses], frames=17))
+    pipeline = pipeline_of(write_scene(tmp_path, LENSES[lenses], frames=17))  # pyrefly: ignore[bad-argument-type]
     grey_ball(pipeline, monkeypatch)
     before, after = errors(pipeline)
     assert before > 0.15 and after < 0.25 * before

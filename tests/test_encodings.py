@@ -3,6 +3,7 @@
 import multiprocessing
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,10 +46,10 @@ def small_shares(monkeypatch):
 
 def both(seed: int = 0, **size) -> tuple[HashEncoding, FusedHashEncoding]:
     """nerfstudio's encoding and a fused one with the same table, its values between -1 and 1."""
-    made = []
+    made: list[Any] = []
     for kind in (HashEncoding, FusedHashEncoding):
         torch.manual_seed(seed)
-        made.append(kind(**{"hash_init_scale": 1.0, **size}, implementation="torch"))
+        made.append(kind(**{"hash_init_scale": 1.0, **size}, implementation="torch"))  # pyrefly: ignore
     assert torch.equal(made[0].hash_table, made[1].hash_table)
     return made[0], made[1]
 

@@ -242,6 +242,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], dict[str, Any]]] = {
             same,
             {
                 "model__depth_loss": name,
+                # pyrefly: ignore[unexpected-keyword]
                 f"losses__{name.replace('-', '_')}": replace(depth_losses.LOSSES[name](), sigma_m=1e-3),
             },
         )

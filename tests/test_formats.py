@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def smooth(height: int = 12, width: int = 16) -> np.ndarray:
 def with_orientation(path: Path, pixels: np.ndarray, orientation: int) -> Path:
     exif = Image.Exif()
     exif[0x112] = orientation
-    best = {".jpg": {"quality": 97, "subsampling": 0}, ".webp": {"lossless": True}}
+    best: dict[str, dict[str, Any]] = {".jpg": {"quality": 97, "subsampling": 0}, ".webp": {"lossless": True}}
     Image.fromarray(pixels).save(path, exif=exif.tobytes(), **best.get(path.suffix, {}))
     return path
 

@@ -278,7 +278,8 @@ def write_drive(folder: Path, numbers: int = 12, cameras: tuple[str, ...] = ("le
         "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
         "1.0 3.0 0.0\n4.0 -2.0 1.0\n"
     )
-    meta = {"camera_model": "PINHOLE", "w": SIZE[0], "h": SIZE[1], "fl_x": 8.0, "fl_y": 8.0, "cx": 8.0, "cy": 6.0}
+    meta: dict[str, Any] = {"camera_model": "PINHOLE", "w": SIZE[0], "h": SIZE[1]}
+    meta |= {"fl_x": 8.0, "fl_y": 8.0, "cx": 8.0, "cy": 6.0}
     meta["camera_fits"] = {camera: {"rms_px": 0.01, "max_px": 0.03, "theta_max_deg": 90.0} for camera in cameras}
     meta |= {"train_filenames": names[False], "val_filenames": names[True], "test_filenames": names[True]}
     write_json(folder / "transforms.json", {**meta, "frames": frames, "ply_file_path": "points.ply"})

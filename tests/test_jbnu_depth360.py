@@ -3,6 +3,7 @@
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,8 +33,8 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def options(root: Path, **changes) -> JbnuDepth360Options:
-    given = {"root": root, "calibration": root / "calibration.toml", "output": root.parent / "scene", "strict": True}
-    given |= {"refine_poses": False, "find_ego": False}
+    given: dict[str, Any] = {"root": root, "calibration": root / "calibration.toml", "output": root.parent / "scene"}
+    given |= {"strict": True, "refine_poses": False, "find_ego": False}
     return JbnuDepth360Options(**given | changes)
 
 

@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 import cv2
 import data_sets
@@ -183,7 +184,7 @@ def odometry(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def options(root: Path, sequence: str = DRIVE, **changes) -> KittiOptions:
-    given = {"find_ego": False, "sky": False, "strict": True, "refine_poses": False, **changes}
+    given: dict[str, Any] = {"find_ego": False, "sky": False, "strict": True, "refine_poses": False, **changes}
     return KittiOptions(root=root, sequence=sequence, output=root.parent / "scene", **given)
 
 

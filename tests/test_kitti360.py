@@ -79,7 +79,7 @@ STEP_M = 1 / 256
 def process(drive: RoomDrive | Path, output: Path, **options: Any) -> ProcessReport:
     root = drive if isinstance(drive, Path) else drive.root
     console = options.pop("console", Console(quiet=True))
-    given = {"root": root, "sequence": SEQUENCE, "output": output, "sweeps": 0, "strict": True}
+    given: dict[str, Any] = {"root": root, "sequence": SEQUENCE, "output": output, "sweeps": 0, "strict": True}
     given |= {"refine_poses": False, "find_ego": False}
     return convert(Kitti360Options(**given | options), console)
 

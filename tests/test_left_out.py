@@ -5,6 +5,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,8 +40,8 @@ def drive(whole: RoomDrive, tmp_path: Path) -> RoomDrive:
 
 def run(drive: RoomDrive, scene: str = "scene", **changes) -> tuple[ProcessReport, str]:
     folder = drive.root.parent
-    options = {"root": drive.root, "sequence": SEQUENCE, "output": folder / scene, "mono": folder / "mono", "sweeps": 1}
-    options |= {"find_ego": False, "sky": False, "refine_poses": False, **changes}
+    options: dict[str, Any] = {"root": drive.root, "sequence": SEQUENCE, "output": folder / scene}
+    options |= {"mono": folder / "mono", "sweeps": 1, "find_ego": False, "sky": False, "refine_poses": False, **changes}
     console = Console(width=400, force_terminal=False)
     with console.capture() as said:
         report = convert(Kitti360Options(**options), console)

@@ -63,7 +63,7 @@ def test_near_and_far_are_metres_and_are_not_reset():
     model = build(near_m=0.4, far_m=500.0)
     for training in (True, False):
         model.train(training)
-        bundle = model.collider(rays())
+        bundle = model.collider(rays())  # pyrefly: ignore[not-callable]
         assert torch.allclose(bundle.nears * METRES_PER_UNIT, torch.tensor(0.4))
         assert torch.allclose(bundle.fars * METRES_PER_UNIT, torch.tensor(500.0))
     samples = trained_step(model)[0]["ray_samples_list"][0].frustums
@@ -457,7 +457,7 @@ def test_levels_that_do_not_learn_are_left_out_and_the_others_pull_as_before(los
         outputs, losses = trained_step(model)
         assert [weights.requires_grad for weights in outputs["weights_list"]] == [not rests] * 2 + [True]
         levels = levels_of(outputs)
-        object_of = model.step_losses[LOSSES[loss]].loss
+        object_of = model.step_losses[LOSSES[loss]].loss  # pyrefly: ignore[missing-attribute]
         counted = 16 if object_of.over_all_rays else 12
         used = levels[-1:] if rests and loss != "urban-nerf" else levels
         found = [object_of(replace(level, final=levels[-1])).sum() / counted for level in used]

@@ -304,9 +304,9 @@ METRIC_Z = {"maps": Path("m"), "maps_kind": "metric", "maps_along": "z"}
         ({**METRIC_Z, "scenes": (Path("a"), Path("b"))}, "contains the maps of one scene, but 2 scenes are given"),
     ],
 )
-def test_options_that_do_not_go_together(options, expected):
+def test_options_that_do_not_go_together(options: Any, expected: str):
     with pytest.raises(InputError, match=expected):
-        EstimateDepthOptions(**{"scenes": (Path("a"),), **options}).check()
+        EstimateDepthOptions(**dict[str, Any](scenes=(Path("a"),)) | options).check()
 
 
 def test_arrays_are_in_metres(scene, tmp_path):

@@ -182,7 +182,7 @@ def seen_in_the_ball(picture: ScenePicture, in_camera: np.ndarray) -> np.ndarray
     """Distance from a picture of `write_scene` to the wall, along rays of the camera."""
     world = in_camera @ (picture.rotation @ FLIP[:3, :3]).T
     along = world @ picture.position_m
-    return -along + np.sqrt(along**2 + RADIUS_M**2 - picture.position_m @ picture.position_m)
+    return -along + np.sqrt(along**2 + RADIUS_M**2 - picture.position_m @ picture.position_m)  # pyrefly: ignore
 
 
 @pytest.mark.parametrize("kind", ["relative", "inverse"])

@@ -479,7 +479,7 @@ def test_a_map_has_the_size_of_its_picture_and_begins_as_the_room(small_street):
     directions, valid = LENS.unproject(LENS.pixel_centres())
     rays = torch.nan_to_num(directions).numpy() @ (picture.rotation @ np.diag([1.0, -1.0, -1.0])).T
     wall_m = TINY.room_radius_m / np.maximum(np.hypot(rays[..., 0], rays[..., 1]), 0.1)
-    floor_m = np.where(rays[..., 2] < 0, HEIGHT_M / np.maximum(-rays[..., 2], 1e-9), np.inf)
+    floor_m = np.where(rays[..., 2] < 0, HEIGHT_M / np.maximum(-rays[..., 2], 1e-9), np.inf)  # pyrefly: ignore
     inside = (valid & (directions[..., 2] >= np.cos(np.radians(95)))).numpy()
     np.testing.assert_allclose(found[inside], np.minimum(wall_m, floor_m)[inside], rtol=1e-4)
 
@@ -649,7 +649,7 @@ def test_bad_scenes_and_options_are_named(tmp_path, small_street):
     with pytest.raises(FileNotFoundError):
         estimate_depth(EstimateDepthOptions((tmp_path / "none",)), QUIET)
     wrong: list[dict[str, Any]] = [{"train_steps": 0}, {"seconds": 0.0}, {"seconds": float("nan")}]
-    for bad in [*wrong, {"output": Path("x.pt")}]:
+    for bad in (*wrong, dict[str, Any](output=Path("x.pt"))):
         with pytest.raises(InputError, match="expected"):
             EstimateDepthOptions((small_street,), **bad).check()
     for lidar in (small_street / "lidar").iterdir():

@@ -78,7 +78,7 @@ def test_a_checkpoint_holds_weights_alone(tmp_path, kind):
         load_dir, load_step = folder, None
 
     with pytest.raises((pickle.UnpicklingError, AssertionError, RuntimeError)) as raised:
-        eval_utils.eval_load_checkpoint(Config(), Pipeline())  # pyright: ignore[reportArgumentType]
+        eval_utils.eval_load_checkpoint(Config(), Pipeline())  # pyrefly: ignore
     assert not sign.exists()
     if kind != "in a scalar":
         assert isinstance(raised.value, pickle.UnpicklingError)
@@ -100,7 +100,7 @@ def test_weights_are_no_pickle(tmp_path):
 def config(tmp_path_factory) -> Path:
     settings = edge_depth_nerf_lite.config
     parser = FisheyeDepthDataParserConfig(metres_per_unit=7.5, eval_interval=5)
-    manager = replace(settings.pipeline.datamanager, dataparser=parser, data=Path("/drives/street"))  # pyright: ignore
+    manager = replace(settings.pipeline.datamanager, dataparser=parser, data=Path("/drives/street"))  # pyrefly: ignore
     whole = replace(settings, pipeline=replace(settings.pipeline, datamanager=manager))
     path = tmp_path_factory.mktemp("config") / "config.yml"
     path.write_text(yaml.dump(whole))

@@ -58,12 +58,12 @@ class Motion(Drive):
         object.__setattr__(self, "_poses", poses)
 
     def pose_to_world(self, time_s: np.ndarray) -> np.ndarray:
-        return self._poses(time_s)  # pyright: ignore[reportAttributeAccessIssue]
+        return self._poses(time_s)  # pyrefly: ignore
 
 
 @functools.cache
 def rendered(scene: str) -> tuple[World, Poses]:
-    model = build_scene(SynthesizeOptions(Path("none"), scene, frames=FRAMES))  # pyright: ignore[reportArgumentType]
+    model = build_scene(SynthesizeOptions(Path("none"), scene, frames=FRAMES))  # pyrefly: ignore
     return World(model, 0), model.drive.pose_to_world
 
 
@@ -354,7 +354,7 @@ def test_what_a_car_does_is_no_break(interval_s):
 )
 def test_what_no_car_does_is_named(speed, course_deg, message):
     later = np.arange(40) >= 20
-    path = driven(np.where(later, *speed[::-1]), np.radians(np.where(later, *course_deg[::-1])), 0.1)
+    path = driven(np.where(later, *speed[::-1]), np.radians(np.where(later, *course_deg[::-1])), 0.1)  # pyrefly: ignore
     found = find_break(path)
     assert found is not None and found.first < 20 <= found.last
     assert math.isclose(found.first, 15, abs_tol=5)

@@ -169,7 +169,7 @@ def test_the_sky_is_known_where_there_is_no_prior(tmp_path):
 def test_packed_records_are_unpacked_to_the_same_batch(tmp_path):
     rng = np.random.default_rng(3)
     records = np.frombuffer(rng.bytes(500 * RECORD.itemsize), RECORD).copy()
-    records["picture"] %= 1 << 31
+    records["picture"] %= 1 << 31  # pyrefly: ignore[unsupported-operation]
     # the sky, a large sigma with a distance, no prior, and the ends of what the fields hold
     records["distance"][:40], records["sigma"][:20] = 0, 65535
     records["sigma"][20:40], records["distance"][40:60], records["sigma"][40:80] = 0, 65535, 65535

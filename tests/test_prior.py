@@ -1,4 +1,5 @@
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -85,8 +86,8 @@ def a_calibration(**changes):
     models = {
         name: ErrorModel(float(np.log(part)), flat) for name, part in (("error_model", 0.1), ("return_model", 0.01))
     }
-    fields = {"made_of": "", "field_rad": (-1.0, 1.0), "everywhere": False, "drive_fit": None, **models, **changes}
-    return Calibration(**fields)
+    fields: dict[str, Any] = {"made_of": "", "field_rad": (-1.0, 1.0), "everywhere": False, "drive_fit": None, **models}
+    return Calibration(**fields | changes)
 
 
 def level_view(shape):

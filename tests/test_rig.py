@@ -7,6 +7,7 @@ import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,8 +65,8 @@ def mine(drive: Path, tmp_path: Path) -> Path:
 
 
 def options(root: Path, **changes) -> RigOptions:
-    given = {"root": root, "output": root.parent / "scene", "theta_max_deg": 110.0, "strict": True}
-    return RigOptions(**{**given, "refine_poses": False, "find_ego": False, **changes})
+    given: dict[str, Any] = {"root": root, "output": root.parent / "scene", "theta_max_deg": 110.0, "strict": True}
+    return RigOptions(**given | {"refine_poses": False, "find_ego": False} | changes)
 
 
 def read(root: Path, **changes) -> Recording:

@@ -345,7 +345,7 @@ def reported(x: float, aspect: float = 1.5) -> CameraState:
 def asked(machine: CoarseToFine) -> tuple[str, float, float] | None:
     """What is rendered next: the action, the place and the aspect ratio."""
     action = machine.next_action
-    return action and (action.action, float(action.camera_state.c2w[0, 3]), action.camera_state.aspect)
+    return (action.action, float(action.camera_state.c2w[0, 3]), action.camera_state.aspect) if action else None
 
 
 def test_a_browser_that_changes_its_size_does_not_move(machine):

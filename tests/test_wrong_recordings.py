@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -175,7 +176,7 @@ def test_small_faults_are_named_with_their_amount(recording: Recording, change: 
     (warning,) = checked(change(recording)).warnings
     assert re.search(said, warning), warning
     if change is turned_5:
-        rows = np.array(ast.literal_eval(re.search(r"to_vehicle = (\[.*\])\)", warning)[1]))  # pyright: ignore
+        rows = np.array(ast.literal_eval(re.search(r"to_vehicle = (\[.*\])\)", warning)[1]))  # pyrefly: ignore
         assert np.allclose(rows, recording.sweeps[0].to_vehicle @ rigid(about_z(-5)), atol=0.01)
 
 
@@ -263,7 +264,7 @@ def test_the_real_drive(real_data: Path) -> None:
 )
 def test_depth_maps_are_held_against_the_pictures(brief: Recording, factor: float, kind: str, said: str | None) -> None:
     pictures = [
-        replace(one, depth=DepthFile(one.truth_distance, factor / 256, kind))  # pyright: ignore[reportArgumentType]
+        replace(one, depth=DepthFile(one.truth_distance, factor / 256, kind))  # pyrefly: ignore
         for one in brief.pictures
     ]
     found = checked(replace(brief, pictures=tuple(pictures), sweeps=()))
@@ -382,8 +383,8 @@ def edit(root: Path, change: Callable[[str], str]) -> None:
 
 
 def run(root: Path, **changes) -> tuple[ProcessReport, str]:
-    given = {"root": root, "output": root.parent / "scene", "frames": 7, "sweeps": 1, "holdout_every": 4}
-    given |= {"refine_poses": False}
+    given: dict[str, Any] = {"root": root, "output": root.parent / "scene", "frames": 7, "sweeps": 1}
+    given |= {"holdout_every": 4, "refine_poses": False}
     console = Console(width=10_000, force_terminal=False)
     with console.capture() as said:
         report = convert(RigOptions(**{**given, **changes}), console)

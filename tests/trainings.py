@@ -19,7 +19,7 @@ def write_config(config: Path, scene: Path) -> Path:
     """Write the config.yml of a training on a scene, with 10 m in a unit; without checkpoints."""
     settings = edge_depth_nerf_lite.config
     parser = FisheyeDepthDataParserConfig(metres_per_unit=10.0)
-    datamanager = replace(settings.pipeline.datamanager, dataparser=parser, data=scene)  # pyright: ignore
+    datamanager = replace(settings.pipeline.datamanager, dataparser=parser, data=scene)  # pyrefly: ignore
     config.parent.mkdir(parents=True, exist_ok=True)
     config.write_text(yaml.dump(replace(settings, pipeline=replace(settings.pipeline, datamanager=datamanager))))
     return config

@@ -42,7 +42,7 @@ HOLDOUT_EVERY = 8
 
 
 def drive(output: Path, **options: object) -> SynthesizeOptions:
-    made = SynthesizeOptions(output=output, **options)  # pyright: ignore[reportArgumentType]
+    made = SynthesizeOptions(output=output, **options)  # pyrefly: ignore
     synthesize_drive(made)
     return made
 

@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pyarrow import feather  # pyright: ignore[reportMissingImports]
+from pyarrow import feather  # pyrefly: ignore
 
 
 def rows(path: Path) -> list[dict[str, Any]]:

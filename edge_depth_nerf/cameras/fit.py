@@ -103,7 +103,7 @@ def fit_kannala_brandt(source: Camera, theta_max_rad: float = math.radians(95)) 
         return np.concatenate((of_x, of_y))
 
     # scipy's stub knows `jac` only as the name of a finite-difference scheme
-    found = least_squares(residual, start, jacobian, method="lm", x_scale="jac", xtol=1e-14, ftol=1e-14)  # pyright: ignore[reportArgumentType]
+    found = least_squares(residual, start, jacobian, method="lm", x_scale="jac", xtol=1e-14, ftol=1e-14)  # pyrefly: ignore
     camera = KannalaBrandt(source.width, source.height, *found.x.tolist(), theta_limit_rad=limit)
 
     directions, pixels = _rays(source, limit, _CHECK_GRID)

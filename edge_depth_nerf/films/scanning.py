@@ -182,7 +182,8 @@ def evaluate(
     found = {name: errors(*both) for name, both in together.items() if len(both[0])}
     if bright:
         recorded, rendered = map(np.concatenate, zip(*bright, strict=True))
-        if usual := float(np.abs(recorded - np.median(recorded)).mean()):
+        if usual := float(np.abs(recorded - np.median(recorded)).mean()):  # pyrefly: ignore[no-matching-overload]
+            # pyrefly: ignore[unsupported-operation]
             found["sweeps_in_pictures"]["intensity_error"] = float(np.abs(rendered - recorded).mean()) / usual
     for key in ("drop_f1", "chamfer_m"):
         if of_scans := [each[key] for each in more if key in each]:

@@ -61,7 +61,7 @@ def read_dataparser(path: Path) -> Any:
             f"{path}: its dataparser is {shown(name)}, expected one of {', '.join(known)}. Train with "
             "fisheye-depth-data or nerfstudio-data."
         )
-    settings = {}
+    settings: dict[str, Any] = {}
     hints = get_type_hints(known[name])
     for field in dataclasses.fields(known[name]):
         found = _child(node, field.name)
@@ -72,7 +72,7 @@ def read_dataparser(path: Path) -> Any:
             raise InputError(f"{path}: dataparser.{field.name} is {shown(value)}, which is not a valid value. {_HINT}.")
         settings[field.name] = value
     data = _value(_child(manager, "data"))
-    return known[name](**{**settings, **({"data": data} if isinstance(data, Path) else {})})
+    return known[name](**{**settings, **({"data": data} if isinstance(data, Path) else {})})  # pyrefly: ignore
 
 
 def _compose(text: str) -> Any:

@@ -151,7 +151,7 @@ def steps(pictures: Sequence[ScenePicture]) -> list[Step]:
                 after,
                 length_m=float(np.linalg.norm(after.position_m - before.position_m)),
                 turn_deg=math.degrees(math.acos(np.clip(cosine, -1, 1))),
-                seconds=after.timestamp_s - before.timestamp_s if timed else None,  # pyright: ignore
+                seconds=after.timestamp_s - before.timestamp_s if timed else None,  # pyrefly: ignore
             )
         )
     return found

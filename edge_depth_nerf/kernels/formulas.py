@@ -137,5 +137,5 @@ def hash_grid(
     for corner in itertools.product((0, 1), repeat=3):
         x, y, z = (hashed[upper][..., axis] for axis, upper in enumerate(corner))
         shares = [place[..., axis] if upper else 1 - place[..., axis] for axis, upper in enumerate(corner)]
-        encoded = encoded + math.prod(shares)[..., None] * table[first + (x ^ y ^ z) % rows]  # pyright: ignore[reportIndexIssue]
+        encoded = encoded + math.prod(shares)[..., None] * table[first + (x ^ y ^ z) % rows]  # pyrefly: ignore
     return encoded.flatten(1).to(dtype or positions.dtype)

@@ -217,5 +217,5 @@ def field(
     """
     form = runs, directions, len(first[0]), dtype, torch.is_grad_enabled()
     parameters = *first[0], *second[0], *first[1], *second[1]
-    before, colours = _Field.apply(encoded, of_rays, form, *parameters)  # pyright: ignore[reportGeneralTypeIssues]
+    before, colours = _Field.apply(encoded, of_rays, form, *parameters)  # pyrefly: ignore
     return before, colours

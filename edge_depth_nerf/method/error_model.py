@@ -98,7 +98,7 @@ def pixel_features(
         "distance_m": distance_m,
         "theta_deg": np.degrees(theta_rad).astype(np.float32),
         "nearest_px": np.asarray(cv2.distanceTransform((~lidar_points).astype(np.uint8), cv2.DIST_L2, 5), np.float32),
-        "spread": spread_m / np.maximum(distance_m, 1e-3),
+        "spread": spread_m / np.maximum(distance_m, 1e-3),  # pyrefly: ignore[bad-assignment]
         "step": np.maximum(highest - lowest, 0),
     }
 
@@ -131,7 +131,7 @@ def motion_features(
         # distance is no factor, but σ̂ is a share of it
         **{name: features[name] for name in ("distance_m", "spread", "step")},
         "elevation_deg": np.degrees(elevation_rad).astype(np.float32),
-        "by_matching": sigma_m / np.maximum(motion_m, np.float32(1e-3)),
+        "by_matching": sigma_m / np.maximum(motion_m, np.float32(1e-3)),  # pyrefly: ignore[bad-assignment]
         "rim_px": np.asarray(cv2.distanceTransform(whole.astype(np.uint8), cv2.DIST_L2, 5), np.float32),
     }
 
@@ -163,12 +163,12 @@ class ErrorModel:
 
 def _log_scale(scaled_error: NDArray) -> float:
     """Give the logarithm of half of what 95 % of the errors are within."""
-    return float(np.log(max(np.quantile(scaled_error, 0.95) / 2, 1e-6)))
+    return float(np.log(max(float(np.quantile(scaled_error, 0.95)) / 2, 1e-6)))
 
 
 def _log_middle_scale(scaled_error: NDArray) -> float:
     """Average that with the logarithm of what 68.3 % are within: between one sigma and two."""
-    return 0.5 * (_log_scale(scaled_error) + float(np.log(max(np.quantile(scaled_error, 0.683), 1e-6))))
+    return 0.5 * (_log_scale(scaled_error) + float(np.log(max(float(np.quantile(scaled_error, 0.683)), 1e-6))))
 
 
 def fit_error_model(

@@ -421,7 +421,7 @@ def _errors_of_both(
     evaluated = _some(left_out & (motion_m > 0) & (aligned > 0), _EVALUATED_A_FRAME, np.random.default_rng([9, number]))
     true_m = maps.lidar_m[evaluated]
     errors = np.stack([np.abs(found[evaluated] - true_m) / true_m for found in (motion_m, aligned)])
-    return errors, elevation_rad[maps.usable & (maps.lidar_m > 0)]
+    return errors, elevation_rad[maps.usable & (maps.lidar_m > 0)]  # pyrefly: ignore[bad-return]
 
 
 def _motion_errors(of_frames: Sequence[NDArray[np.float32]]) -> MotionErrors | None:

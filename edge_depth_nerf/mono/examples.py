@@ -166,7 +166,7 @@ def load_examples(
 
 def bytes_a_picture(pictures: Sequence[ScenePicture], working_px: int, weighted: bool = False) -> int:
     """Memory that one picture takes at most, with or without weights of its distances."""
-    largest = max(np.prod(working_size(p.lens.width, p.lens.height, working_px)) for p in pictures)
+    largest = max(np.prod(working_size(p.lens.width, p.lens.height, working_px)) for p in pictures)  # pyrefly: ignore
     return int(largest) * (3 + 4 + 1 + 4 * weighted)
 
 

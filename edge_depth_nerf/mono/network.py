@@ -233,7 +233,7 @@ def settings_from(found: Any, path: Path) -> NetworkSettings:
             f"{path}: its settings describe no network: {found}. Expected channels (multiples of {_GROUPS}), "
             "working_px, camera_height_m and room_radius_m. Train it again, without --model."
         )
-    return NetworkSettings(tuple(channels), working_px, *lengths)
+    return NetworkSettings(tuple(channels), working_px, *lengths)  # pyrefly: ignore[bad-argument-type]
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:

@@ -433,7 +433,7 @@ def _save(path: Path, state: _State, network: DepthNetwork, optimizer: HiddenMuo
     tensors = {f"network/{name}": tensor for name, tensor in network.state_dict().items()}
     tensors |= {f"best/{name}": tensor for name, tensor in best.items()}
     tensors |= {f"optimizer/{name}": tensor for name, tensor in optimizer.tensors()}
-    header = asdict(state)
+    header: dict[str, Any] = asdict(state)
     header["best"] = None if math.isinf(state.best) else state.best
     write_tensors(path, tensors, header)
 

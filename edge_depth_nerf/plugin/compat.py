@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
@@ -34,7 +34,7 @@ def allow_numpy_scalars_in_checkpoints() -> None:
     import torch
 
     scalar = np.float64(0).__reduce__()[0]
-    allowed = [(scalar, "numpy.core.multiarray.scalar"), (scalar, "numpy._core.multiarray.scalar"), np.dtype]
+    allowed: list[Any] = [(scalar, "numpy.core.multiarray.scalar"), (scalar, "numpy._core.multiarray.scalar"), np.dtype]
     allowed += [type(np.dtype(kind)) for kind in (np.float64, np.float32, np.int64)]
     torch.serialization.add_safe_globals(allowed)
 
@@ -52,7 +52,7 @@ def lpips_not_built() -> Iterator[None]:
     import torchmetrics.image.lpip as module  # a second and more; nerfstudio's commands start without it
 
     original = module.LearnedPerceptualImagePatchSimilarity
-    module.LearnedPerceptualImagePatchSimilarity = lambda **_: None
+    module.LearnedPerceptualImagePatchSimilarity = lambda **_: None  # pyrefly: ignore[bad-assignment]
     try:
         yield
     finally:
@@ -164,6 +164,6 @@ def join_lines_of_option_help() -> None:
         return
 
     def joined(described: object) -> dict[str, str]:
-        return {name: " ".join(text.split()) for name, text in parse(described).items()}
+        return {name: " ".join(text.split()) for name, text in parse(described).items()}  # pyrefly: ignore
 
-    _docstrings.parse_docstring_from_object = joined
+    _docstrings.parse_docstring_from_object = joined  # pyrefly: ignore[bad-assignment]

@@ -176,8 +176,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
     config: FisheyeDepthDataManagerConfig
     train_dataset: FisheyeDepthDataset
     eval_dataset: FisheyeDepthDataset
-    train_pixel_sampler: TablePixelSampler | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
-    eval_pixel_sampler: TablePixelSampler | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    train_pixel_sampler: TablePixelSampler | None = None  # pyrefly: ignore
+    eval_pixel_sampler: TablePixelSampler | None = None  # pyrefly: ignore
     trained_on: Tensor
     """Picture, row and column of each ray of the last training batch."""
 
@@ -350,6 +350,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
                 raise
             raise InputError(
+                # pyrefly: ignore[bad-argument-type]
                 f"{path.parent}: the table of pixels cannot be written ({os.strerror(error.errno)}); it needs up to "
                 f"{most * RECORD.itemsize / 1e9:.2g} GB. Free some space there, or choose another folder with "
                 "--pipeline.datamanager.cache-dir."

@@ -63,7 +63,7 @@ class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig, SceneOptions):
 
     _target: type = field(default_factory=lambda: FisheyeDepth)
     """Target class to instantiate."""
-    depth_unit_scale_factor: tyro.conf.Suppress[float | None] = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    depth_unit_scale_factor: tyro.conf.Suppress[float | None] = None  # pyrefly: ignore
     """Metres per count of the files under depth_file_path. Not set: what transforms.json says, else nerfstudio's
     0.001."""
     downscale_factor: tyro.conf.Suppress[int | None] = 1

@@ -123,11 +123,11 @@ class EdgeDepthNerfModelConfig(NerfactoModelConfig, ModelOptions):
     """Target class to instantiate."""
     camera_optimizer: CameraOptimizerConfig = field(default_factory=PoseRefinerConfig)
     """Poses that training refines."""
-    proposal_warmup: float = 1 / 6  # pyright: ignore[reportIncompatibleVariableOverride]
+    proposal_warmup: float = 1 / 6  # pyrefly: ignore
     """How long the proposal networks are trained less and less often: below 1 a share of the training, else steps."""
-    proposal_weights_anneal_max_num_iters: float = 1 / 30  # pyright: ignore[reportIncompatibleVariableOverride]
+    proposal_weights_anneal_max_num_iters: float = 1 / 30  # pyrefly: ignore
     """How long the proposals' weights count less than later: below 1 a share of the training, else steps."""
-    implementation: Literal["fused", "torch"] = "fused"  # pyright: ignore[reportIncompatibleVariableOverride]
+    implementation: Literal["fused", "torch"] = "fused"  # pyrefly: ignore
     """fused: our kernels. torch: nerfstudio's code, with the same results and checkpoints, but many times slower on a
     CPU."""
 

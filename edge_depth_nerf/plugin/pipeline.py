@@ -69,7 +69,7 @@ class NotFiniteError(InputError):
 class EdgeDepthPipeline(VanillaPipeline):
     """nerfstudio's pipeline with pooled depth errors."""
 
-    datamanager: FisheyeDepthDataManager  # pyright: ignore[reportIncompatibleVariableOverride]
+    datamanager: FisheyeDepthDataManager  # pyrefly: ignore
 
     def __init__(self, config: EdgeDepthPipelineConfig, device: str | torch.device, *args: Any, **kwargs: Any) -> None:
         """Build both parts; a model gets neither a prior nor further pixels that it would not use.

@@ -253,7 +253,7 @@ def _records(picture: PicturePixels, number: int) -> NDArray:
         records["distance"] = to_steps(picture.prior_distance_m[rows, columns])
         # without a distance a large sigma would say "sky"
         sigma = _sigma_steps(picture.prior_sigma_m[rows, columns])
-        records["sigma"] = np.where(records["distance"] > 0, sigma, 0)
+        records["sigma"] = np.where(records["distance"] > 0, sigma, 0)  # pyrefly: ignore[unsupported-operation]
     if picture.sky is not None:
         records["sigma"][picture.sky[rows, columns] & (records["distance"] == 0)] = SKY
     return records

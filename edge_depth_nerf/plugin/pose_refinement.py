@@ -32,7 +32,7 @@ class PoseRefinerConfig(CameraOptimizerConfig):
 
     _target: type = field(default_factory=lambda: PoseRefiner)
     """Target class to instantiate."""
-    mode: Literal["off", "SO3xR3"] = "off"  # pyright: ignore[reportIncompatibleVariableOverride]
+    mode: Literal["off", "SO3xR3"] = "off"  # pyrefly: ignore
     """SO3xR3: training refines the poses, except those of held-out pictures. off: no pose is refined."""
     sigma_m: float = 0.03
     """Expected error of the given positions: standard deviation in metres."""

@@ -44,7 +44,7 @@ class NoBackground(RGBRenderer):
             return (weights * rgb).sum(dim=-2)
         # random: its word for a background that is added later
         background = "last_sample" if self.shows_last_sample else "random"
-        return super().forward(rgb, weights, *args, **{**kwargs, "background_color": background})
+        return super().forward(rgb, weights, *args, **{**kwargs, "background_color": background})  # pyrefly: ignore
 
 
 class DepthInEvaluation(DepthRenderer):

@@ -30,9 +30,9 @@ def proposals_in_steps(config: Any, steps: int) -> None:
 class TrainingScheduleConfig(ExponentialDecaySchedulerConfig):
     """nerfstudio's exponential decay, over the steps of the training unless a number of steps is given."""
 
-    max_steps: int | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    max_steps: int | None = None  # pyrefly: ignore
     """The step from which the learning rate is `lr_final`. Not set: the end of the training."""
-    warmup_steps: float = 0.0  # pyright: ignore[reportIncompatibleVariableOverride]
+    warmup_steps: float = 0.0  # pyrefly: ignore
     """How long the learning rate rises: below 1 a share of the training, else steps."""
 
     def over(self, steps: int) -> ExponentialDecaySchedulerConfig:

@@ -70,7 +70,7 @@ class EdgeDepthTrainerConfig(TrainerConfig, TrainingOptions):
 
         scene = self.pipeline.datamanager.data
         lines = [f"{self.method_name}: {self.max_num_iterations} steps on {self.machine.device_type}, scene {scene}"]
-        for name, value in changed_settings(self, all_methods.get(self.method_name)).items():
+        for name, value in changed_settings(self, all_methods.get(self.method_name)).items():  # pyrefly: ignore
             lines.append(f"  --{name.replace('_', '-')} {value.__qualname__ if isinstance(value, type) else value}")
         CONSOLE.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
 
@@ -97,12 +97,12 @@ class EdgeDepthTrainer(Trainer):
     Ctrl-C ends it after the current step, with a checkpoint of that step and a line on how to resume.
     """
 
-    config: EdgeDepthTrainerConfig  # pyright: ignore[reportIncompatibleVariableOverride]
+    config: EdgeDepthTrainerConfig  # pyrefly: ignore
 
     def __init__(self, config: EdgeDepthTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         """Initialise it as nerfstudio's Trainer."""
         super().__init__(config, local_rank, world_size)
-        self.grad_scaler = PatientGradScaler(enabled=self.use_grad_scaler and self.device != "cpu")
+        self.grad_scaler = PatientGradScaler(enabled=self.use_grad_scaler and self.device != "cpu")  # pyrefly: ignore
         self._interruption = _Interruption()
         self._last_step: int | None = None  # of this process
         self.graphs: StepGraphs | None = None

@@ -219,7 +219,7 @@ def _sampled(picture: Float32[np.ndarray, "h w"], places: Float[np.ndarray, "...
     padded = np.pad(flat, ((0, 0), (0, rows * 8192 - flat.shape[1]), (0, 0))).reshape(rows, 8192, 2)
     if not rows:
         return np.zeros(places.shape[:-1], np.float32)
-    found = cv2.remap(picture, padded, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # pyright: ignore
+    found = cv2.remap(picture, padded, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # pyrefly: ignore
     return found.reshape(-1)[: flat.shape[1]].reshape(places.shape[:-1])
 
 
@@ -764,7 +764,7 @@ def _figures(source: _Source, view: _View, fit: _Fit, apart_m: float | None) -> 
         apart_m,
         None if median is None else math.exp(median),
         None if median is None else float(np.median(np.abs(logs - median))),
-        tuple(math.exp(np.median(part)) if len(part) >= _FEWEST_RATIOS else None for part in thirds),  # pyright: ignore
+        tuple(math.exp(np.median(part)) if len(part) >= _FEWEST_RATIOS else None for part in thirds),  # pyrefly: ignore
     )
 
 

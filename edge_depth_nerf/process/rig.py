@@ -120,7 +120,7 @@ def recording_of_rig(rig: Rig, options: _Options, kind: str, numbered: Numbered 
     """
     root, cameras = options.root, _chosen(rig, options.cameras)
     files = {camera.name: _timed(_files(root, camera.images, IMAGE_SUFFIXES), camera, numbered) for camera in cameras}
-    path, camera_poses = numbered and numbered.path, {}
+    path, camera_poses = numbered.path if numbered else None, {}
     if options.poses == "recorded" and numbered is None:
         if rig.poses is None:
             raise InputError(
@@ -598,7 +598,7 @@ class _Companions:
                 )
         self._found = {
             (camera.name, what): _by_stem(
-                _files(options.root, given, IMAGE_SUFFIXES if what == "masks" else (".png",)),
+                _files(options.root, given, IMAGE_SUFFIXES if what == "masks" else (".png",)),  # pyrefly: ignore
                 f"{rig}: cameras.{camera.name}.{what}",
             )
             for camera in cameras
@@ -641,7 +641,7 @@ class _Companions:
             time_s=picture.time_s,
             camera_to_world=camera_to_world,
             timestamp_s=picture.time_s,
-            depth=depth_file,
+            depth=depth_file,  # pyrefly: ignore[bad-argument-type]
             mask=mask,
             mono=mono,
             truth_distance=truth_distance,

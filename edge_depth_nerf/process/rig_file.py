@@ -356,7 +356,7 @@ class RigLidar(_Sensor):
             array=self.array,
             names=self.names.model_dump(),
             metres_per_unit=self.metres_per_unit,
-            times=times and PointTimes(times.column, _SECONDS[times.unit], absolute=times.counted_from == "clock"),
+            times=PointTimes(times.column, _SECONDS[times.unit], times.counted_from == "clock") if times else None,
         )
 
     @property

@@ -73,7 +73,7 @@ def build_report(report: Report) -> str:
     in_3d = ["ogl.min.js", "points.js"] if any(drive.points for drive in report.drives) else []
     scripts = [folder.joinpath(name).read_text(encoding="utf-8") for name in (*in_3d, "script.js")]
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.globals["svg"] = lambda content: data_uri(content, "image/svg+xml")
+    environment.globals["svg"] = lambda content: data_uri(content, "image/svg+xml")  # pyrefly: ignore
     # only these scripts and this style are allowed, even if a text contains others
     policy = (
         "default-src 'none'; base-uri 'none'; form-action 'none'; img-src data:; "

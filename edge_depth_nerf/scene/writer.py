@@ -512,7 +512,8 @@ def _rounded(camera: KannalaBrandt | Pinhole) -> KannalaBrandt:
     """Keep nine digits: the last ones of a fit depend on how its sums were shared among threads."""
     assert isinstance(camera, KannalaBrandt)
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2")
-    return replace(camera, **{name: float(f"{getattr(camera, name):.9g}") for name in names})
+    rounded: dict[str, Any] = {name: float(f"{getattr(camera, name):.9g}") for name in names}
+    return replace(camera, **rounded)
 
 
 def _off_pixel_centre(camera: KannalaBrandt) -> KannalaBrandt:

@@ -65,7 +65,7 @@ _ONCE_ONLY: dict[str, Any] = {"layout": "kitti-360", "shifts_m": [1.0, 2.0]}
 
 
 def _manifest(options: SynthesizeOptions) -> dict[str, Any]:
-    fields = dataclasses.asdict(options)
+    fields: dict[str, Any] = dataclasses.asdict(options)
     del fields["output"]
     fields["shifts_m"] = [float(shift_m) for shift_m in options.shifts_m]
     fields = {name: value for name, value in fields.items() if _ONCE_ONLY.get(name) != value}

@@ -237,7 +237,7 @@ def _model(camera: Camera) -> dict[str, Any]:
     """A camera as a rig file describes it, with OpenCV's pixel centres, in which it was calibrated."""
     found = camera.to_dict()
     del found["theta_limit_rad"]
-    found |= {"model": _MODELS[type(camera)], "cx": camera.cx - 0.5, "cy": camera.cy - 0.5}
+    found |= {"model": _MODELS[type(camera)], "cx": camera.cx - 0.5, "cy": camera.cy - 0.5}  # pyrefly: ignore
     return {key: value for key, value in found.items() if value != 0.0}
 
 

@@ -209,7 +209,7 @@ class FusedNerfactoField(NerfactoField):
         """Give the appearance of each ray's picture; at evaluation the mean of all, or none, as nerfstudio has it."""
         assert self.embedding_appearance is not None
         if self.training:
-            return self.embedding_appearance(torch.cat([each.camera_indices[:, 0, 0] for each in parts]))  # pyright: ignore[reportOptionalSubscript]
+            return self.embedding_appearance(torch.cat([each.camera_indices[:, 0, 0] for each in parts]))  # pyrefly: ignore
         mean = self.embedding_appearance.mean(dim=0)
         shown = mean if self.use_average_appearance_embedding else torch.zeros_like(mean)
         return shown.expand(sum(len(each) for each in parts), -1)

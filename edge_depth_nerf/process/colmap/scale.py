@@ -351,7 +351,7 @@ def _points_in_camera(
 
 def _depth_points(picture: RecordedPicture, camera: Camera) -> Float64[np.ndarray, "values 3"]:
     """The points of a depth map in the camera's frame."""
-    distance = picture.depth and read_if_whole(partial(read_depth, picture.depth, camera))
+    distance = read_if_whole(partial(read_depth, picture.depth, camera)) if picture.depth else None
     if distance is None:
         return np.zeros((0, 3))
     of_pixels = rays(camera)
