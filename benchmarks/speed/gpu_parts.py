@@ -256,7 +256,7 @@ def steps(settings: Settings) -> Found:
     """Milliseconds of a step of ours, as it is and without graphs, and of nerfacto in torch, in turns."""
     from benchmarks.speed import turns
 
-    count, rounds = (1, 1) if settings.fake else (30, 3)
+    count, rounds = (1, 1) if settings.fake else (20, 2)
     names = [turns.REFERENCE, "ours", *([] if settings.fake else [turns.EAGER])]
     configs = turns.configurations("full", settings.scene, names, settings.adjust)
     firsts = [first + number * count for first in (turns.WARM_UPS, LATE) for number in range(rounds)]
@@ -525,7 +525,7 @@ METHODS = {
 """Methods of `compare`, and seeds: the rivals have no extras, as they were published."""
 PARTS = {
     "recording": Part(started, 50),
-    "steps": Part(steps, 90),
+    "steps": Part(steps, 60),
     "profile": Part(profile, 40),
     "start": Part(started, 35),
     "kernels": Part(kernels, 60),
