@@ -102,7 +102,7 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python docs/check_prose.py
-	$(BIN)/pyrefly check
+	$(BIN)/pyrefly check --min-severity error
 
 format: setup
 	$(BIN)/ruff check --fix .
