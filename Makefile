@@ -29,12 +29,12 @@ TEMPORARY_GB := 3.6
 # in several wheels that overwrite each other; the one with contrib and without a window goes last. Bytecode of all
 # packages would take two minutes; Python makes that of what is imported.
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
+UV = $(BIN)/uv pip install --cache-dir $(VENV)/.uv --python $(BIN)/python -c constraints.txt
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) .ci/enough_space.py $(VENV) $(PACKAGES_GB) $(TEMPORARY_GB)
 	@echo "Installing into $(VENV): a minute with uv, some with pip, which prints nothing while it works; 9 GB."
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) uv
-	$(BIN)/uv pip install --cache-dir $(VENV)/.uv --python $(BIN)/python -c constraints.txt -e '.[dev]' || $(PIP) -e '.[dev]'
+	$(PIP) uv && $(UV) -e '.[dev]' || $(PIP) -e '.[dev]'
 	rm -rf $(VENV)/.uv
 	$(PIP) --no-deps --force-reinstall opencv-contrib-python-headless
 	touch $@

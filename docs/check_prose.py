@@ -21,7 +21,7 @@ from typing import Any
 if sys.version_info >= (3, 11):
     import tomllib
 else:
-    import tomli as tomllib  # pyrefly: ignore
+    import tomli as tomllib  # pyrefly: ignore[missing-import]
 
 ROOT = Path(__file__).resolve().parents[1]
 RULES = Path(__file__).with_name("prose_rules.toml")

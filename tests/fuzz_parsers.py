@@ -12,7 +12,7 @@ import time
 import warnings
 from pathlib import Path
 
-import atheris  # pyrefly: ignore
+import atheris  # pyrefly: ignore[missing-import]
 
 SEEN = ["edge_depth_nerf.process", "edge_depth_nerf.base.bounds", "edge_depth_nerf.base.files"]
 with atheris.instrument_imports(include=SEEN):  # pyrefly: ignore

@@ -160,4 +160,4 @@ def test_maps_of_different_sizes(unchecked_types):
     with pytest.raises(InputError, match=r"lidar_m \(120, 159\), mono_m \(120, 160\)"):
         align(mono[:, 1:], mono, EVERYWHERE)
     with pytest.raises(InputError, match="align is 'much'"):
-        align(mono, mono, EVERYWHERE, "much")  # pyrefly: ignore
+        align(mono, mono, EVERYWHERE, "much")  # pyrefly: ignore[bad-argument-type]

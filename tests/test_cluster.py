@@ -310,7 +310,7 @@ def test_a_drive_is_cut_as_by_hand(room: RoomDrive, tmp_path: Path, monkeypatch:
     assert [path.name for path in cut] == list(by_hand)
     console = Console(file=io.StringIO(), width=200)
     process_drive(options_of(room, tmp_path / "there", frames_per_scene=3, cluster="local"), console)
-    assert "5 usable frames, split into 2 scenes" in console.file.getvalue()  # pyrefly: ignore
+    assert "5 usable frames, split into 2 scenes" in console.file.getvalue()  # pyrefly: ignore[missing-attribute]
     wanted = files_of(tmp_path / "hand")
     assert len([name for name in wanted if name.endswith(".png") and "/images/" in name]) == 2 * 5
     assert files_of(tmp_path / "here") == wanted and files_of(tmp_path / "there") == wanted
@@ -370,7 +370,7 @@ def test_a_comparison_goes_on_when_a_worker_is_killed(tmp_path: Path, monkeypatc
     console = Console(file=io.StringIO(), width=200)
     results = compare(asked, console)
     killer.join()
-    assert "sample edge seed 0: worker lost" in console.file.getvalue()  # pyrefly: ignore
+    assert "sample edge seed 0: worker lost" in console.file.getvalue()  # pyrefly: ignore[missing-attribute]
     assert [run.method for run in results.runs] == ["edge"]
     assert (folder / "run.log").read_text().count("$ ") == 2 and (folder / "edge.kept").read_text() == "0 1 2 3 "
     # what is done is done: the same tables come from the same command without a cluster

@@ -518,7 +518,7 @@ def test_combined_sigma_wants_mono_only_where_it_counts(unchecked_types):
     with pytest.raises(InputError, match="needs mono_m"):
         sigma_m(integrate_depth(lidar, mono, valid), "combined")
     with pytest.raises(InputError, match="sigma mode is 'magic'; expected one of 'constant'"):
-        sigma_m(integrate_depth(lidar, mono, valid), "magic")  # pyrefly: ignore
+        sigma_m(integrate_depth(lidar, mono, valid), "magic")  # pyrefly: ignore[bad-argument-type]
     with pytest.raises(InputError, match="constant_m is 0"):
         sigma_m(integrate_depth(lidar, mono, valid), "constant", constant_m=0.0)
 

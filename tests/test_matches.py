@@ -156,7 +156,7 @@ def test_masks_and_sizes() -> None:
     x, y = found.sights.pixels.T
     assert x.min() >= 200 and x.max() <= 1300 and y.min() >= 200 and y.max() <= 700
     # features of the picture made smaller lie where those of the whole one do
-    detector = cv2.SIFT_create(500, enable_precise_upscale=True)  # pyrefly: ignore
+    detector = cv2.SIFT_create(500, enable_precise_upscale=True)  # pyrefly: ignore[missing-attribute]
     whole = detector.detect(drawn[..., 0], None)
     places = np.array([point.pt for point in whole]) + 0.5
     apart = np.linalg.norm(places[:, None] - found.sights.pixels, axis=-1)

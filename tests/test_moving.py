@@ -212,7 +212,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def options(root: Path, output: Path, **more: object) -> RigOptions:
     given = {"find_moving": True, "refine_poses": False, "sweeps": 0, **more}
-    return RigOptions(root=root, output=output, **given)  # pyrefly: ignore
+    return RigOptions(root=root, output=output, **given)  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -78,7 +78,7 @@ def test_a_checkpoint_holds_weights_alone(tmp_path, kind):
         load_dir, load_step = folder, None
 
     with pytest.raises((pickle.UnpicklingError, AssertionError, RuntimeError)) as raised:
-        eval_utils.eval_load_checkpoint(Config(), Pipeline())  # pyrefly: ignore
+        eval_utils.eval_load_checkpoint(Config(), Pipeline())  # pyrefly: ignore[bad-argument-type]
     assert not sign.exists()
     if kind != "in a scalar":
         assert isinstance(raised.value, pickle.UnpicklingError)

@@ -63,7 +63,7 @@ class Motion(Drive):
 
 @functools.cache
 def rendered(scene: str) -> tuple[World, Poses]:
-    model = build_scene(SynthesizeOptions(Path("none"), scene, frames=FRAMES))  # pyrefly: ignore
+    model = build_scene(SynthesizeOptions(Path("none"), scene, frames=FRAMES))  # pyrefly: ignore[bad-argument-type]
     return World(model, 0), model.drive.pose_to_world
 
 

@@ -26,7 +26,7 @@ def main(scene: Path, folder: Path) -> None:
         losses.append({"total": float(total)} | {name: float(value) for name, value in each.items()})
         return total, each, metrics
 
-    trainer.train_iteration = watched  # pyrefly: ignore
+    trainer.train_iteration = watched  # pyrefly: ignore[bad-assignment]
     trainer.train()
     (folder / "losses.json").write_text(json.dumps(losses))
 

@@ -141,7 +141,7 @@ def with_graphs(trainer: EdgeDepthTrainer, monkeypatch: pytest.MonkeyPatch, **fa
 def never_recorded(trainer: EdgeDepthTrainer) -> EdgeDepthTrainer:
     """The same steps, one after the other."""
     trainer.graphs = StepGraphs(trainer, RunAgain(trainer))
-    trainer.graphs._try_to_record = lambda *_: None  # pyrefly: ignore
+    trainer.graphs._try_to_record = lambda *_: None  # pyrefly: ignore[bad-assignment]
     return trainer
 
 

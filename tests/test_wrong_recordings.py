@@ -264,7 +264,7 @@ def test_the_real_drive(real_data: Path) -> None:
 )
 def test_depth_maps_are_held_against_the_pictures(brief: Recording, factor: float, kind: str, said: str | None) -> None:
     pictures = [
-        replace(one, depth=DepthFile(one.truth_distance, factor / 256, kind))  # pyrefly: ignore
+        replace(one, depth=DepthFile(one.truth_distance, factor / 256, kind))  # pyrefly: ignore[bad-argument-type]
         for one in brief.pictures
     ]
     found = checked(replace(brief, pictures=tuple(pictures), sweeps=()))

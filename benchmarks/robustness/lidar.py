@@ -42,7 +42,7 @@ HOLDOUT_EVERY = 8
 
 
 def drive(output: Path, **options: object) -> SynthesizeOptions:
-    made = SynthesizeOptions(output=output, **options)  # pyrefly: ignore
+    made = SynthesizeOptions(output=output, **options)  # pyrefly: ignore[bad-argument-type]
     synthesize_drive(made)
     return made
 

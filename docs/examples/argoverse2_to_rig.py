@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pyarrow import feather  # pyrefly: ignore
+from pyarrow import feather  # pyrefly: ignore[missing-import]
 
 
 def rows(path: Path) -> list[dict[str, Any]]:

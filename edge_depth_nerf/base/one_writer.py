@@ -100,7 +100,7 @@ def _try_lock(handle: int) -> None:
         return
     assert msvcrt is not None
     try:
-        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # pyrefly: ignore
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # pyrefly: ignore[missing-attribute]
     except PermissionError as error:
         raise BlockingIOError from error
 
@@ -108,7 +108,7 @@ def _try_lock(handle: int) -> None:
 def _unlock(folder: Path, handle: int) -> None:
     """Let go of what `_locked` gave."""
     if msvcrt is not None:
-        msvcrt.locking(handle, msvcrt.LK_UNLCK, 1)  # pyrefly: ignore
+        msvcrt.locking(handle, msvcrt.LK_UNLCK, 1)  # pyrefly: ignore[missing-attribute]
     os.close(handle)
     if fcntl is None:
         try:

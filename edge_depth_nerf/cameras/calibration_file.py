@@ -24,7 +24,7 @@ from edge_depth_nerf.cameras.wide import EUCM, DoubleSphere, OCam
 if sys.version_info >= (3, 11):
     import tomllib
 else:
-    import tomli as tomllib  # pyrefly: ignore
+    import tomli as tomllib  # pyrefly: ignore[missing-import]
 
 RATIONAL = (
     "k4, k5 and k6 belong to OpenCV's rational model, which has no place here: calibrate again without "

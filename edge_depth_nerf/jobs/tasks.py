@@ -61,13 +61,13 @@ def own_command(words: Sequence[str], options: Any) -> tuple[str, ...]:
 def with_absolute_paths(options: Options) -> Options:
     """The same options wherever they are read: a worker has a working directory of its own."""
     changes: dict[str, Any] = {}
-    for entry in dataclasses.fields(options):  # pyrefly: ignore
+    for entry in dataclasses.fields(options):  # pyrefly: ignore[bad-argument-type]
         value = getattr(options, entry.name)
         if isinstance(value, Path):
             changes[entry.name] = value.absolute()
         elif isinstance(value, tuple) and any(isinstance(each, Path) for each in value):
             changes[entry.name] = tuple(each.absolute() for each in value)
-    return dataclasses.replace(options, **changes)  # pyrefly: ignore
+    return dataclasses.replace(options, **changes)  # pyrefly: ignore[bad-specialization]
 
 
 def shares_told(tell: Callable[[float], None]) -> Callable[[str], None]:

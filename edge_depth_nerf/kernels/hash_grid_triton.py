@@ -24,7 +24,7 @@ from edge_depth_nerf.kernels.triton_launch import launch
 POINTS = 128
 """Points that one program works on, one a thread."""
 SUMMED_POINTS = 64
-"""Those of a program that sums up; sums of more points would not find registers on all GPUs."""
+"""Those of a program that sums up: of 32, 64 and 128 an H200 was fastest with 64."""
 
 
 @triton.jit

@@ -309,7 +309,7 @@ def _npz_header(path: Path, size: int, scan: ScanFormat) -> _Header:
 def _feather_table(path: Path, columns: list[str] | None = None) -> Any:
     """Open a table, its columns mapped into memory; compressed ones are unpacked when they are asked for."""
     try:
-        from pyarrow import ArrowException, feather  # pyrefly: ignore
+        from pyarrow import ArrowException, feather  # pyrefly: ignore[missing-import]
     except ImportError:
         raise InputError(
             f"{path}: reading .feather scans needs pyarrow, which is not installed. Run `pip install "

@@ -51,7 +51,7 @@ class CoarseToFine(RenderStateMachine):
         `shows_detail` says whether complete pictures are to have the detail of training pictures.
         """
         super().__init__(viewer, VISER_NERFSTUDIO_SCALE_RATIO, client)
-        self._moves: dict[str, dict[str, str]] = self.transitions  # pyrefly: ignore
+        self._moves: dict[str, dict[str, str]] = self.transitions  # pyrefly: ignore[bad-assignment]
         self._moves["low_static"]["static"] = "middle"
         self._moves["middle"] = {"static": "high", "step": "high", "move": "low_move", "rerender": "low_static"}
         self._shows_detail = shows_detail

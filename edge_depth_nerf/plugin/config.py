@@ -33,7 +33,7 @@ from edge_depth_nerf.plugin.trainer import EdgeDepthTrainerConfig
 if sys.version_info >= (3, 11):
     import tomllib
 else:
-    import tomli as tomllib  # pyrefly: ignore
+    import tomli as tomllib  # pyrefly: ignore[missing-import]
 
 
 @dataclass

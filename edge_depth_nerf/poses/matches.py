@@ -135,7 +135,7 @@ def find_features(picture: PosedPicture, most: int = MOST_FEATURES) -> Features:
     # the picture's own border is no edge of the mask: SIFT keeps away from it by itself
     reach = np.ones((2 * _BORDER_PX + 1, 2 * _BORDER_PX + 1), np.uint8)
     mask = cv2.erode(mask, reach)
-    detector = cv2.SIFT_create(nfeatures=most, enable_precise_upscale=True)  # pyrefly: ignore
+    detector = cv2.SIFT_create(nfeatures=most, enable_precise_upscale=True)  # pyrefly: ignore[missing-attribute]
     found, descriptors = detector.detectAndCompute(grey, 255 * mask)
     if descriptors is None:
         found, descriptors = [], np.zeros((0, 128), np.float32)
