@@ -162,11 +162,11 @@ def test_the_sky_is_known_where_there_is_no_prior(tmp_path):
     assert table.share_with_prior == 0.5
     assert torch.equal(batch.sky[:, 0], rows < 3)  # a distance says more than the colour of the sky
     assert torch.equal(batch.prior_sigma_m[:, 0] > 0, rows >= 3)
-    chosen = batch[batch.sky[:, 0]]
+    chosen = batch.where(batch.sky[:, 0])
     assert torch.equal(chosen.indices, batch.indices[rows < 3]) and chosen.sky.all()
 
 
-def test_packed_records_are_unpacked_to_the_same_batch(tmp_path):
+def test_packed_records_are_unpacked_to_what_their_fields_hold():
     rng = np.random.default_rng(3)
     records = np.frombuffer(rng.bytes(500 * RECORD.itemsize), RECORD).copy()
     records["picture"] %= 1 << 31  # pyrefly: ignore[unsupported-operation]
@@ -174,14 +174,19 @@ def test_packed_records_are_unpacked_to_the_same_batch(tmp_path):
     records["distance"][:40], records["sigma"][:20] = 0, 65535
     records["sigma"][20:40], records["distance"][40:60], records["sigma"][40:80] = 0, 65535, 65535
     records["picture"][:9], records["row"][:9], records["column"][:9] = [0, 1, 65535, 65536] + [2**31 - 1] * 5, 65535, 0
-    table = table_of(tmp_path / "t.npy", [np.ones((2, 2), bool)])
-    table._records = records
-    expected = table.batch(0, len(records))
-    found = decode(torch.from_numpy(table.records(0, len(records)).view(np.uint8).reshape(-1, RECORD.itemsize).copy()))
-    assert expected.sky.sum() == 20
-    for name in ("indices", "rgb", "prior_distance_m", "prior_sigma_m", "sky"):
-        value, other = getattr(found, name), getattr(expected, name)
-        assert torch.equal(value, other) and value.dtype == other.dtype, name
+    sky = (records["distance"] == 0) & (records["sigma"] == 65535)
+    expected = {
+        "indices": np.stack([records[name].astype(np.int64) for name in ("picture", "row", "column")], 1),
+        "rgb": records["rgb"].astype(np.float32) / 255,
+        "prior_distance_m": records["distance"].astype(np.float32)[:, None] / 256,
+        "prior_sigma_m": np.where(sky, 0, records["sigma"].astype(np.float32) / 256)[:, None].astype(np.float32),
+        "sky": sky[:, None],
+    }
+    found = decode(torch.from_numpy(records.view(np.uint8).reshape(-1, RECORD.itemsize)))
+    assert sky.sum() == 20
+    for name, value in expected.items():
+        assert torch.equal(getattr(found, name), torch.from_numpy(value)), name
+        assert getattr(found, name).numpy().dtype == value.dtype, name
 
 
 def test_the_share_with_a_prior(tmp_path):

