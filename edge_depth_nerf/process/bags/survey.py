@@ -122,9 +122,9 @@ def look_at(bag: Bag, options: UnpackOptions) -> Survey:
             by_type.setdefault(topic.type, []).append(topic)
     for topic in bag.topics:
         found.taken[topic.name] = _default(topic)
-    infos = [(topic, *_first(bag, topic.name)) for topic in by_type.get(INFO, [])]
-    taken_infos = _find_cameras(bag, options, found, by_type, [(topic, message) for topic, _, message in infos])
-    for topic, _, _ in infos:
+    infos = [(topic, next(bag.messages([topic.name]))[2]) for topic in by_type.get(INFO, [])]
+    taken_infos = _find_cameras(bag, options, found, by_type, infos)
+    for topic, _ in infos:
         used = [camera.name for camera in found.cameras if taken_infos.get(camera.name) == topic.name]
         found.taken[topic.name] = f"calibration of {', '.join(used)}" if used else "calibration, of no camera taken"
     _find_scanners(bag, options, found, by_type)
@@ -149,11 +149,6 @@ def _default(topic: Topic) -> str:
     if topic.type in PACKETS:
         return "nothing: packets of a scanner; play the bag through its driver, and record its points"
     return "nothing" if topic.readable else "nothing: of a type that is not known"
-
-
-def _first(bag: Bag, topic: str) -> tuple[int, Any]:
-    _, recorded_ns, message = next(bag.messages([topic]))
-    return recorded_ns, message
 
 
 def _peek(bag: Bag, options: UnpackOptions, topic: Topic) -> list[tuple[int, Any]]:
@@ -256,7 +251,7 @@ def _find_scanners(bag: Bag, options: UnpackOptions, found: Survey, by_type: dic
         messages = _peek(bag, options, topic)
         if len(messages) < 2 and not options.topics:
             found.taken[topic.name] = "nothing: a single cloud, not scans"
-        elif topic.type == CLOUD and messages and scans.layout_of(messages[0][1]) is None:
+        elif topic.type == CLOUD and messages and not {*"xyz"} <= scans.fields_of(messages[0][1]).keys():
             found.taken[topic.name] = "nothing: clouds without fields x, y and z"
         elif messages:
             candidates.append((topic, messages))
