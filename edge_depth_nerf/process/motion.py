@@ -14,7 +14,7 @@ import functools
 import hashlib
 import io
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -141,52 +141,33 @@ class SphereSweepCache:
         """Make a folder in `root` for these pictures, in `motion`'s order, and remove those of other ones."""
         self.folder = root / _made_of(scene, pictures)
         self._motion = motion
-        self._swept = functools.lru_cache(_SWEEPS_IN_MEMORY)(partial(_swept, self.folder, motion))
+        self._swept = functools.lru_cache(_SWEEPS_IN_MEMORY)(self._sweep)
         for other in root.glob("*"):
             if other != self.folder:
                 shutil.rmtree(other, ignore_errors=True)
 
-    def make(self, index: int) -> bool:
-        """Sweep a picture, unless that is done; whether it had to be."""
-        path = _file(self.folder, index)
-        if _read(path, Swept) is not None:
-            return False
-        _write(path, self._motion.sweep(index))
-        return True
+    def make(self, index: int) -> None:
+        """Sweep a picture, unless that is done."""
+        self._sweep(index)
+
+    def _sweep(self, index: int) -> Swept:
+        return _kept(self.folder / f"{index:06d}.npz", Swept, partial(self._motion.sweep, index))
 
     def confirmed(self, index: int) -> MotionDistance:
         """What neighbours confirm of a picture's sweep; kept."""
-        path = _file(self.folder, index).with_suffix(".confirmed.npz")
-        found = _read(path, MotionDistance)
-        if found is None:
-            found = self._motion.confirm(index, self._swept)
-            _write(path, found)
-        return found
+        confirm = partial(self._motion.confirm, index, self._swept)
+        return _kept(self.folder / f"{index:06d}.confirmed.npz", MotionDistance, confirm)
 
 
-def _file(folder: Path, index: int) -> Path:
-    return folder / f"{index:06d}.npz"
-
-
-def _swept(folder: Path, motion: Motion, index: int) -> Swept:
-    """The sweep of a picture; one that is lost is made again."""
-    swept = _read(_file(folder, index), Swept)
-    return motion.sweep(index) if swept is None else swept
-
-
-def _read(path: Path, kind: type[Maps]) -> Maps | None:
-    """Maps of a picture, if they are kept."""
+def _kept(path: Path, kind: type[Maps], make: Callable[[], Maps]) -> Maps:
+    """Maps of a picture from its file; those that are lost are made, and kept."""
     content = content_of(path, VERSION)
-    if content is None:
-        return None
-    return kind(**load_archive(content))
-
-
-def _write(path: Path, maps: Swept | MotionDistance) -> None:
-    """Keep maps of a picture."""
-    archive = io.BytesIO()
-    np.savez(archive, **{field.name: getattr(maps, field.name) for field in dataclasses.fields(maps)})
+    if content is not None:
+        return kind(**load_archive(content))
+    maps, archive = make(), io.BytesIO()
+    np.savez(archive, **vars(maps))
     write_checked(path, VERSION, lambda file: file.write(archive.getbuffer()))
+    return maps
 
 
 def _made_of(scene: SceneFolder, pictures: list[ScenePicture]) -> str:
