@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import cv2
@@ -148,23 +148,22 @@ class _Points:
     in_scanner: Float64[np.ndarray, "n 3"]
     offset_s: Float64[np.ndarray, "n"]
     sweep: RecordedSweep
-    _given: list[Float64[np.ndarray, "n 3"]] = field(default_factory=list)
-    """Where they are as given, once that was asked."""
+    path: Trajectory
 
-    def world(self, reading: Reading, path: Trajectory) -> Float64[np.ndarray, "n 3"]:
+    def world(self, reading: Reading) -> Float64[np.ndarray, "n 3"]:
         """Where they are, read in another way."""
-        if reading.keeps_scans:
-            # most readings of cameras: found once
-            if not self._given:
-                self._given.append(self._placed(reading, path))
-            return self._given[0]
-        return self._placed(reading, path)
+        # most readings of cameras keep the scans: found once
+        return self._given if reading.keeps_scans else self._placed(reading)
 
-    def _placed(self, reading: Reading, path: Trajectory) -> Float64[np.ndarray, "n 3"]:
+    @cached_property
+    def _given(self) -> Float64[np.ndarray, "n 3"]:
+        return self._placed(Reading())
+
+    def _placed(self, reading: Reading) -> Float64[np.ndarray, "n 3"]:
         offset_s = self.offset_s if reading.point_times is None else reading.point_times(self.offset_s)
         times_s = torch.from_numpy(self.sweep.time_s + reading.scans_later_s + offset_s)
         in_vehicle = torch.from_numpy(_moved(reading.scanner(self.sweep.to_vehicle), self.in_scanner))
-        return (path if reading.path is None else reading.path(path)).to_world(in_vehicle, times_s).numpy()
+        return (self.path if reading.path is None else reading.path(self.path)).to_world(in_vehicle, times_s).numpy()
 
 
 @dataclass(frozen=True)
@@ -255,6 +254,15 @@ def _steps(points: Float64[np.ndarray, "n 3"]) -> np.ndarray:
     return order[found]
 
 
+def _pairs_apart(places: Float64[np.ndarray, "n 3"], far_m: float) -> list[tuple[int, int]]:
+    """Some of the places, spread over the drive, each with the next one that is so far away: indices."""
+    pairs = []
+    for first in spread_over(len(places), _TRIED):
+        far = np.flatnonzero(np.linalg.norm(places[first + 1 :] - places[first], axis=-1) >= far_m)
+        pairs += [(first, first + 1 + int(far[0]))] if len(far) else []
+    return pairs
+
+
 class _View:
     """A camera of the recording, with the pictures that are compared."""
 
@@ -274,20 +282,18 @@ class _View:
         pictures = [one for one in recording.pictures if one.camera == self.camera.name]
         pictures.sort(key=lambda one: one.time_s)
         places = np.array([recording.pose(picture)[:3, 3] for picture in pictures]).reshape(-1, 3)
-        pairs = []
-        for first in spread_over(len(pictures), _TRIED):
-            far = np.flatnonzero(np.linalg.norm(places[first + 1 :] - places[first], axis=-1) >= _MOVED_M)
-            pairs += [(pictures[first], pictures[first + 1 + int(far[0])])] if len(far) else []
+        pairs = _pairs_apart(places, _MOVED_M)
         found = []
         for index in spread_over(len(pairs), _PAIRS):
-            read = [read_if_whole(partial(read_image, picture.path)) for picture in pairs[index]]
+            first, second = (pictures[one] for one in pairs[index])
+            read = [read_if_whole(partial(read_image, picture.path)) for picture in (first, second)]
             if read[0] is None or read[1] is None:
                 continue
             contrasts = [_contrast(downscale_image(picture, self._factors[0])) for picture in (read[0], read[1])]
             edges = _edges(downscale_image(read[0], self._factors[1]))
             inner = self._finer_usable > 0
             edges /= max(float(edges[inner].mean()) if inner.any() else 1.0, 1e-6)
-            found.append(_Pair(pairs[index], (contrasts[0], contrasts[1]), edges))
+            found.append(_Pair((first, second), (contrasts[0], contrasts[1]), edges))
         return found
 
     def poses(self, pair: _Pair, reading: Reading) -> tuple[Transform, Transform]:
@@ -377,40 +383,36 @@ class _Source:
         """Read a sweep, once."""
         if recorded.path not in self._scans:
             read = read_if_whole(recorded.read)
-            self._scans[recorded.path] = None if read is None else _scan(read, recorded)
+            self._scans[recorded.path] = None if read is None else _scan(read, recorded, self._path)
         return self._scans[recorded.path]
 
     def fit(self, view: _View, pairs: Iterable[_Pair], reading: Reading) -> _Fit:
         """How well a reading of this fits a camera."""
         values, edges, asked = [], [], 0
         for pair in pairs:
-            scan = None
-            if pair.pictures[0].depth is not None:
-                world = self._of_map(view, pair, reading)
-            else:
-                scan = self.nearest(pair.pictures[0].time_s + reading.pictures_later_s - reading.scans_later_s)
-                if scan is None:
-                    continue
-                world = scan.seen.world(reading, self._path)
+            world = self.points(view, pair, reading)
+            if world is None:
+                continue
             asked += len(world)
             _, pixels = view.seen(pair, world, reading)
             of_pictures = [_sampled(c, p) for c, p in zip(pair.contrasts, pixels, strict=True)]
             values.append(np.stack([*of_pictures, _sampled(pair.contrasts[1], pixels[0])]))
-            if scan is not None:
-                edges.append(view.edge(pair, scan.edges.world(reading, self._path), reading))
+            if (scan := self.nearest(pair, reading)) is not None:
+                edges.append(view.edge(pair, scan.edges.world(reading), reading))
         return _fit(values, edges, asked)
 
-    def nearest(self, time_s: float) -> _Scan | None:
-        """The sweep of a time, if there is one."""
-        recorded = min(self.sweeps, key=lambda one: abs(one.time_s - time_s))
-        return self.scan(recorded) if abs(recorded.time_s - time_s) <= _APART_S else None
+    def nearest(self, pair: _Pair, reading: Reading) -> _Scan | None:
+        """The sweep of a pair's first picture, if there is one."""
+        time_s = pair.pictures[0].time_s + reading.pictures_later_s - reading.scans_later_s
+        recorded = min(self.sweeps, key=lambda one: abs(one.time_s - time_s), default=None)
+        return self.scan(recorded) if recorded and abs(recorded.time_s - time_s) <= _APART_S else None
 
-    def points(self, view: _View, pair: _Pair) -> Float64[np.ndarray, "n 3"] | None:
-        """What is seen of the world by a pair, as given."""
+    def points(self, view: _View, pair: _Pair, reading: Reading) -> Float64[np.ndarray, "n 3"] | None:
+        """What is seen of the world by a pair."""
         if pair.pictures[0].depth is not None:
-            return self._of_map(view, pair, Reading())
-        scan = self.nearest(pair.pictures[0].time_s)
-        return None if scan is None else scan.seen.world(Reading(), self._path)
+            return self._of_map(view, pair, reading)
+        scan = self.nearest(pair, reading)
+        return None if scan is None else scan.seen.world(reading)
 
     def _of_map(self, view: _View, pair: _Pair, reading: Reading) -> Float64[np.ndarray, "n 3"]:
         picture = pair.pictures[0]
@@ -429,13 +431,8 @@ class _Source:
     @cached_property
     def _two_sweeps(self) -> list[tuple[_Points, _Points]]:
         """Pairs of sweeps between which the vehicle has moved."""
-        if len(self.sweeps) < 2:
-            return []
         places = self._path.at(np.array([one.time_s for one in self.sweeps]))[:, :3, 3]
-        pairs = []
-        for first in spread_over(len(self.sweeps) - 1, _TRIED):
-            far = np.flatnonzero(np.linalg.norm(places[first + 1 :] - places[first], axis=-1) >= _SWEEPS_MOVED_M)
-            pairs += [(first, first + 1 + int(far[0]))] if len(far) else []
+        pairs = _pairs_apart(places, _SWEEPS_MOVED_M)
         found = []
         for index in spread_over(len(pairs), 3):
             scans = [self.scan(self.sweeps[one]) for one in pairs[index]]
@@ -447,7 +444,7 @@ class _Source:
         """Mean distance between the upright surfaces of sweeps, at most half a metre each."""
         found = []
         for few, many in self._two_sweeps:
-            points, others = few.world(reading, self._path), many.world(reading, self._path)
+            points, others = few.world(reading), many.world(reading)
             distance_m, nearest = KDTree(others).query(points, 10, distance_upper_bound=1.0)
             met = np.isfinite(distance_m).all(-1)
             around = others[np.asarray(nearest)[met]]
@@ -462,13 +459,13 @@ class _Source:
         return float(apart.mean()) if len(apart) >= 100 else None
 
 
-def _scan(read: Sweep, recorded: RecordedSweep) -> _Scan:
+def _scan(read: Sweep, recorded: RecordedSweep, path: Trajectory) -> _Scan:
     points = read.points_m.double().numpy()
     offset_s = offsets_s(read, recorded.timing, deskew=True).double().numpy()
     order = np.random.default_rng(0).permutation(len(points))
 
     def some(index: np.ndarray) -> _Points:
-        return _Points(points[index], offset_s[index], recorded)
+        return _Points(points[index], offset_s[index], recorded, path)
 
     few, many = (some(order[:count]) for count in _SWEEP_POINTS)
     return _Scan(some(order[:_POINTS]), some(_steps(points)), few, many)
@@ -521,27 +518,16 @@ def _of_point_times(source: _Source) -> list[Reading]:
     def other_half(given: np.ndarray) -> np.ndarray:
         return np.where(given < middle_s, given + turn_s / 2, given - turn_s / 2)
 
-    by_azimuth = timing is not None
+    backwards = "the point times of {name} count backwards: change their sign, or timestamp"
+    off = "the point times of {name} are off by half a turn"
+    if timing is not None:
+        backwards = "{name} turns the other way: change its direction"
+        off = "the scans of {name} begin on the other side: add 180 to start_azimuth_deg"
+    corrected = "the points of {name} are corrected for the vehicle's motion already: set corrected_to"
     return [
-        Reading(
-            "{name} turns the other way: change its direction"
-            if by_azimuth
-            else "the point times of {name} count backwards: change their sign, or timestamp",
-            point_times=lambda given: 2 * middle_s - given,
-            clear=CLEAR_SMALL,
-        ),
-        Reading(
-            "the scans of {name} begin on the other side: add 180 to start_azimuth_deg"
-            if by_azimuth
-            else "the point times of {name} are off by half a turn",
-            point_times=other_half,
-            clear=CLEAR_SMALL,
-        ),
-        Reading(
-            "the points of {name} are corrected for the vehicle's motion already: set corrected_to",
-            point_times=lambda given: np.full_like(given, middle_s),
-            clear=CLEAR_SMALL,
-        ),
+        Reading(backwards, point_times=lambda given: 2 * middle_s - given, clear=CLEAR_SMALL),
+        Reading(off, point_times=other_half, clear=CLEAR_SMALL),
+        Reading(corrected, point_times=lambda given: np.full_like(given, middle_s), clear=CLEAR_SMALL),
     ]
 
 
@@ -561,16 +547,12 @@ def check_lidar(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h w
     views = [_View(recording, camera, usable[camera.name]) for camera in recording.cameras]
     figures: list[LidarFigures] = []
     warnings: list[str] = []
-    for name in dict.fromkeys(sweep.scanner for sweep in recording.sweeps):
-        source = _Source(recording, name)
-        found, said = _evaluated(source, views)
+    sources = [(name, views) for name in dict.fromkeys(sweep.scanner for sweep in recording.sweeps)]
+    with_maps = [view for view in views if view.pairs and view.pairs[0].pictures[0].depth is not None]
+    for name, seen_by in (*sources, *((view.camera.name, [view]) for view in with_maps)):
+        found, said = _evaluated(_Source(recording, name), seen_by)
         figures += found
         warnings += said
-    for view in views:
-        if view.pairs and view.pairs[0].pictures[0].depth is not None:
-            found, said = _evaluated(_Source(recording, view.camera.name), [view])
-            figures += found
-            warnings += said
     return LidarCheck(tuple(figures), tuple(dict.fromkeys(warnings)))
 
 
@@ -773,7 +755,7 @@ def _ratios(source: _Source, view: _View) -> tuple[np.ndarray, np.ndarray]:
     found, sides = [np.zeros(0)], [np.zeros(0, int)]
     patch = np.stack(np.meshgrid(np.arange(-2.0, 3), np.arange(-2.0, 3)), -1).reshape(-1, 2)
     for pair in view.pairs[1::2]:
-        world = source.points(view, pair)
+        world = source.points(view, pair, Reading())
         if world is None:
             continue
         in_first, (first, _) = view.seen(pair, world, Reading())
