@@ -7,8 +7,9 @@ names the file and the line.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import datetime, timezone
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -166,6 +167,20 @@ def read_times(path: Path, unit: str = "s") -> list[tuple[str | None, float]]:
             )
         found.append((name, time))
     return found
+
+
+def increasing(times_s: Sequence[float], path: Path, otherwise: str = "") -> Sequence[float]:
+    """Check the times of a data set's frames, a line each; what else may be done than to copy the file again.
+
+    Raises:
+        InputError: one is not after the one before.
+    """
+    for line, (before, time) in enumerate(pairwise(times_s), 2):
+        if not time > before:
+            raise InputError(
+                f"{path}, line {line}: not after the line before. Copy the file again from the data set{otherwise}."
+            )
+    return times_s
 
 
 def _time_of_line(words: list[str], where: str) -> tuple[str, str | None, float]:

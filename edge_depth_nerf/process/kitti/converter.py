@@ -27,7 +27,6 @@ import re
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +47,8 @@ from edge_depth_nerf.process.kitti.calibration import (
 )
 from edge_depth_nerf.process.kitti360.calibration import read_timestamps
 from edge_depth_nerf.process.options import KittiOptions
+from edge_depth_nerf.process.poses import increasing, read_times
 from edge_depth_nerf.process.poses import read_kitti as read_kitti_poses
-from edge_depth_nerf.process.poses import read_times
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.rig import Numbered, recording_of_rig, upright_world
 from edge_depth_nerf.process.rig_file import rig_of
@@ -162,13 +161,6 @@ def _path(layout: _Layout) -> Trajectory:
         )
 
 
-def _increasing(times_s: Sequence[float], path: Path) -> Sequence[float]:
-    for line, (before, time) in enumerate(pairwise(times_s), 2):
-        if not time > before:
-            raise InputError(f"{path}, line {line}: not after the line before. Copy the file again from the data set.")
-    return times_s
-
-
 def _raw(options: KittiOptions) -> _Layout:
     """What a drive of the raw data says."""
     day = options.root / options.sequence[:10]
@@ -186,7 +178,7 @@ def _raw(options: KittiOptions) -> _Layout:
     _check_crop(values, folders, lenses_file)
     velodyne_to_camera_0 = read_rectification(values, lenses_file) @ read_rigid(velo_file)
     scans = drive / "velodyne_points"
-    times_s = _increasing(read_timestamps(scans / "timestamps.txt"), scans / "timestamps.txt")
+    times_s = increasing(read_timestamps(scans / "timestamps.txt"), scans / "timestamps.txt")
     turn_s = statistics.median(np.diff(times_s).tolist()) if len(times_s) > 1 else 0.1
     return _Layout(
         calibration=(lenses_file, velo_file, imu_file),
@@ -243,7 +235,7 @@ def _odometry(options: KittiOptions) -> _Layout:
     return _Layout(
         calibration=(calibration,),
         times_file=times_file,
-        times_s=_increasing([time for _, time in read_times(times_file)], times_file),
+        times_s=increasing([time for _, time in read_times(times_file)], times_file),
         lenses={name: read_projection(values, f"P{name[-1]}", calibration) for name in options.cameras},
         folders=folders,
         scans=sequence / "velodyne",

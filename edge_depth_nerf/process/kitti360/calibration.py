@@ -87,10 +87,7 @@ def read_mei_camera(path: Path) -> MEI:
     def number(*keys: str) -> float:
         key = ".".join(keys)
         line, word = text(key)
-        try:
-            return _number(word, path, line)
-        except InputError:
-            raise InputError(f"{path}, line {line}: {key} is not a number: {shown(word)}. {_DOWNLOAD}") from None
+        return finite_number(word, f"{path}, line {line}: {key}", _DOWNLOAD)
 
     line, model = text("model_type")
     if model.strip("\"'") != "MEI":

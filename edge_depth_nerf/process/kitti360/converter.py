@@ -20,18 +20,17 @@ import re
 import statistics
 from collections.abc import Collection, Iterable, Sequence
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.lidar import SweepTiming, check_sweep_size, read_sweep
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.kitti360.calibration import Kitti360Rig, read_poses, read_rig, read_timestamps
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.process.poses import transform_of_rows
+from edge_depth_nerf.process.poses import increasing, transform_of_rows
 from edge_depth_nerf.process.reading import load_distance, load_picture
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.scene.checks import Tolerance, check_distance, check_size, require_folder
@@ -143,10 +142,8 @@ class _Clock:
 def _trajectory(poses: dict[int, np.ndarray], clock: _Clock, path: Path) -> Trajectory:
     frames = sorted(poses)
     times_s = np.array([clock.time_s(frame) for frame in frames])
-    try:
+    with found_in(str(path)):
         return Trajectory(times_s, np.stack([poses[frame] for frame in frames]))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def _near(numbers: np.ndarray, frames: np.ndarray, reach: int, between: bool) -> np.ndarray:
@@ -344,12 +341,7 @@ class Kitti360Drive:
         if not path.is_file():
             return []
         times = read_timestamps(path)
-        for number, (before, time) in enumerate(pairwise(times), 2):
-            if not time > before:
-                raise InputError(
-                    f"{path}, line {number}: not after the line before. Copy the file again from the data set, or move "
-                    "it away: frames then count as 0.1 s apart."
-                )
+        increasing(times, path, ", or move it away: frames then count as 0.1 s apart")
         if missing := [frame for frame in frames if frame >= len(times)]:
             raise InputError(
                 f"{path}: ends after line {len(times)}, but frame {missing[0]} needs line {missing[0] + 1}. The file "
