@@ -617,8 +617,8 @@ class _Companions:
         if orientation != 1:
             self.turned[camera.name][orientation] += 1
         # an option goes before what the rig file names
-        mask = self._by_number("frame_masks", camera, frame) or self._by_name(camera, "masks", picture.path)
-        mono = self._by_number("mono", camera, frame) or self._by_name(camera, "mono", picture.path)
+        mask = self._options.map_of(camera.name, frame, "frame_masks") or self._by_name(camera, "masks", picture.path)
+        mono = self._options.map_of(camera.name, frame, "mono") or self._by_name(camera, "mono", picture.path)
         depth = self._by_name(camera, "depth.files", picture.path)
         truth_distance = self._by_name(camera, "truth_distance", picture.path)
         truth_rgb = self._by_name(camera, "truth_rgb", picture.path)
@@ -659,15 +659,3 @@ class _Companions:
                 "taken, of the picture's name."
             )
         return files[picture.stem]
-
-    def _by_number(self, option: str, camera: RigCamera, frame: int) -> Path | None:
-        folder: Path | None = getattr(self._options, option)
-        if folder is None:
-            return None
-        path = folder / camera.name / f"{frame:010d}.png"
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"{path}: no such file; --{option.replace('_', '-')} needs one for every picture taken, named after "
-                "the frame's number."
-            )
-        return path

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,18 +28,6 @@ EARTH_RADIUS_M = 6378137.0
 _AGAIN = "Copy the file again from the data set."
 
 Values = dict[str, Float64[np.ndarray, "values"]]
-
-
-@dataclass(frozen=True)
-class RectifiedCamera:
-    """A camera of rectified pictures, with the first pixel's centre at 0."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    to_camera_0: Transform
-    """From its frame to that of the rectified camera 0."""
 
 
 def read_values(path: Path) -> Values:
@@ -94,8 +81,11 @@ def read_rectification(values: Values, path: Path) -> Transform:
     return turn
 
 
-def read_projection(values: Values, key: str, path: Path) -> RectifiedCamera:
-    """A camera from its projection matrix P.
+def read_projection(values: Values, key: str, path: Path) -> tuple[dict[str, float], Transform]:
+    """A camera of rectified pictures from its projection matrix P.
+
+    Returns:
+        fx, fy, cx, cy, with the first pixel's centre at 0; and from its frame to that of the rectified camera 0.
 
     Raises:
         InputError: it is missing, or no projection of a rectified camera.
@@ -106,7 +96,7 @@ def read_projection(values: Values, key: str, path: Path) -> RectifiedCamera:
     if wrong:
         raise InputError(f"{path}: {key} is no projection of rectified pictures (fx 0 cx; 0 fy cy; 0 0 1). {_AGAIN}")
     to_camera_0 = rigid(np.eye(3), -np.linalg.solve(lens, column))
-    return RectifiedCamera(lens[0, 0], lens[1, 1], lens[0, 2], lens[1, 2], to_camera_0)
+    return {"fx": lens[0, 0], "fy": lens[1, 1], "cx": lens[0, 2], "cy": lens[1, 2]}, to_camera_0
 
 
 def read_transform(values: Values, key: str, path: Path) -> Transform:

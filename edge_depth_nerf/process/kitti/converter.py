@@ -37,7 +37,6 @@ from edge_depth_nerf.base.files import picture_head
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.kitti.calibration import (
-    RectifiedCamera,
     read_oxts,
     read_projection,
     read_rectification,
@@ -68,8 +67,8 @@ class _Layout:
     """Files whose bytes decide about the scene."""
     times_file: Path
     times_s: Sequence[float]
-    lenses: dict[str, RectifiedCamera]
-    """Of the cameras."""
+    lenses: dict[str, tuple[dict[str, float], Transform]]
+    """Of the cameras: their numbers, and from their frames to the rectified camera 0."""
     folders: dict[str, Path]
     """Of the cameras' pictures."""
     scans: Path
@@ -129,15 +128,14 @@ def _description(layout: _Layout, options: KittiOptions) -> dict[str, Any]:
         return (layout.camera_0_to_vehicle @ to_camera_0).tolist()
 
     cameras = {}
-    for name, lens in layout.lenses.items():
+    for name, (lens, to_camera_0) in layout.lenses.items():
         first = min(layout.folders[name].glob("*.png"), default=None)
         if first is None:
             raise FileNotFoundError(f"{layout.folders[name]}: no .png; the pictures of {name} belong there.")
         width, height, *_ = picture_head(first)
         cameras[name] = {
             **{"images": str(layout.folders[name].relative_to(options.root)), "times_file": times_file},
-            **{"model": "pinhole", "width": width, "height": height},
-            **{"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy, "to_vehicle": mounted(lens.to_camera_0)},
+            **{"model": "pinhole", "width": width, "height": height, **lens, "to_vehicle": mounted(to_camera_0)},
         }
     scanner = {
         **{"scans": str(layout.scans.relative_to(options.root) / "*.bin"), "times_file": times_file},

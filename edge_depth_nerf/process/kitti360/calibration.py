@@ -8,7 +8,6 @@ Each error names the file and the line.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import MEI
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.process.poses import finite_number, seconds_of_date, transform_of_rows
+from edge_depth_nerf.process.recording import RecordedCamera
 
 _MEI_FIELDS = {
     "mirror_parameters": ("xi",),
@@ -30,20 +30,11 @@ _MAX_FRAME = 10**10
 """Numbers of frames have ten digits."""
 
 
-@dataclass(frozen=True)
-class Kitti360Rig:
-    """Where the cameras and the scanner sit on the vehicle."""
+def read_rig(calibration: Path, cameras: tuple[str, ...]) -> tuple[dict[str, RecordedCamera], Transform]:
+    """Read what the folder `calibration` says of some fisheye cameras and the scanner.
 
-    cameras: dict[str, MEI]
-    """The fisheye cameras at their full size."""
-    camera_to_pose: dict[str, Transform]
-    """From each camera's frame to the vehicle's."""
-    velo_to_pose: Transform
-    """From the scanner's frame to the vehicle's."""
-
-
-def read_rig(calibration: Path, cameras: tuple[str, ...]) -> Kitti360Rig:
-    """Read what the folder `calibration` says of the scanner and some fisheye cameras.
+    Returns:
+        The cameras by name, at their full size, and the transform from the scanner's frame to the vehicle's.
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -57,11 +48,11 @@ def read_rig(calibration: Path, cameras: tuple[str, ...]) -> Kitti360Rig:
                 f"{pose_file}: has no line for {name}, only for {', '.join(camera_to_pose) or 'nothing'}. {_DOWNLOAD}"
             )
     cam0_to_velo = read_cam_to_velo(calibration / "calib_cam_to_velo.txt")
-    return Kitti360Rig(
-        cameras={name: read_mei_camera(calibration / f"{name}.yaml") for name in cameras},
-        camera_to_pose={name: camera_to_pose[name] for name in cameras},
-        velo_to_pose=camera_to_pose["image_00"] @ np.linalg.inv(cam0_to_velo),
-    )
+    found = {
+        name: RecordedCamera(name, read_mei_camera(calibration / f"{name}.yaml"), camera_to_pose[name])
+        for name in cameras
+    }
+    return found, camera_to_pose["image_00"] @ np.linalg.inv(cam0_to_velo)
 
 
 def read_mei_camera(path: Path) -> MEI:
