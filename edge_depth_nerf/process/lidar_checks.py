@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import cv2
 import numpy as np
@@ -267,14 +267,17 @@ class _View:
     """A camera of the recording, with the pictures that are compared."""
 
     def __init__(self, recording: Recording, camera: RecordedCamera, usable: Bool[np.ndarray, "h w"]) -> None:
-        self.camera, self._path = camera, recording.trajectory
+        path = recording.trajectory
+        assert path is not None
+        self.camera, self._path = camera, path
         side = max(camera.camera.width, camera.camera.height)
         self._factors = [max(1, round(side / px)) for px in (_CONTRAST_PX, _EDGES_PX)]
         self.small, self._finer = (camera.camera.downscaled(factor) for factor in self._factors)
         self.usable, self._finer_usable = (
             cv2.erode(downscale_mask(usable, factor).astype(np.float32), np.ones((9, 9))) for factor in self._factors
         )
-        self._vehicles: dict[tuple[float, ...], Float64[np.ndarray, "2 4 4"]] = {}
+        # most readings leave the path as it is
+        self._given = lru_cache(None)(lambda *times_s: path.at(np.array(times_s)))
         self.pairs = self._pairs(recording)
 
     def _pairs(self, recording: Recording) -> list[_Pair]:
@@ -298,16 +301,8 @@ class _View:
 
     def poses(self, pair: _Pair, reading: Reading) -> tuple[Transform, Transform]:
         """Camera to world, of both pictures."""
-        assert self._path is not None
-        path = self._path if reading.path is None else reading.path(self._path)
-        times_s = tuple(picture.time_s + reading.pictures_later_s for picture in pair.pictures)
-        if path is not self._path:
-            vehicles = path.at(np.array(times_s))
-        else:
-            # most readings leave the path as it is
-            if times_s not in self._vehicles:
-                self._vehicles[times_s] = path.at(np.array(times_s))
-            vehicles = self._vehicles[times_s]
+        times_s = [picture.time_s + reading.pictures_later_s for picture in pair.pictures]
+        vehicles = self._given(*times_s) if reading.path is None else reading.path(self._path).at(np.array(times_s))
         first, second = (vehicle @ reading.camera(self.camera.to_vehicle) for vehicle in vehicles)
         own = [picture.camera_to_world for picture in pair.pictures]
         if own[0] is not None and own[1] is not None:

@@ -56,11 +56,14 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     if len(pictures) < FEWEST_PICTURES:
         say(console, f"No distances from motion: {len(pictures)} training pictures are too few.", "yellow")
         return
-    motion = Motion(
-        np.stack([picture.position_m for picture in pictures]),
-        [picture.camera for picture in pictures],
-        lambda index: scene_view(scene, pictures[index]),
-    )
+
+    def view(index: int) -> View:
+        """A picture as the sweep wants it."""
+        one = pictures[index]
+        return view_of(scene.rgb(one), scene.usable(one), one.lens, one.pose, scene.theta_max_rad)
+
+    positions_m = np.stack([picture.position_m for picture in pictures])
+    motion = Motion(positions_m, [picture.camera for picture in pictures], view)
     with console.status("Searching for neighbours of pictures …"):
         still = sum(len(motion.neighbours(index)) < LEAST_AGREEING for index in range(len(pictures)))
     if still == len(pictures):
@@ -106,11 +109,6 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     if still:
         said += f"; none for {still} of {len(shares)}: {_STANDS}"
     say(console, f"{said}.", "yellow" if still else None)
-
-
-def scene_view(scene: SceneFolder, picture: ScenePicture) -> View:
-    """A scene's picture as the sweep wants it."""
-    return view_of(scene.rgb(picture), scene.usable(picture), picture.lens, picture.pose, scene.theta_max_rad)
 
 
 def enlarged(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:

@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Float64
@@ -72,12 +71,6 @@ def _turned(axis: str, degrees: float) -> Transform:
 
 def _after(change: Transform) -> Change:
     return lambda given: given @ change
-
-
-def _rescaled(given: Transform, metres: float) -> Transform:
-    found = given.copy()
-    found[:3, 3] *= metres
-    return found
 
 
 def _axes() -> list[tuple[Transform, str]]:
@@ -170,9 +163,7 @@ def small(sensor: str) -> list[Reading]:
 
 def mountings(sensor: str) -> list[Reading]:
     """Large faults of a transform to the vehicle."""
-    found = [
-        _mounting(sensor, "to_vehicle of {name} is inverted: give its inverse", lambda given: np.linalg.inv(given))
-    ]
+    found = [_mounting(sensor, "to_vehicle of {name} is inverted: give its inverse", np.linalg.inv)]
     for change, said in _axes():
         if sensor == "scanner" or np.linalg.det(change[:3, :3]) > 0:
             remedy = "change its to_vehicle, or its points" if sensor == "scanner" else "change its to_vehicle"
@@ -180,7 +171,7 @@ def mountings(sensor: str) -> list[Reading]:
     found += [replace(turn(sensor, "z" if sensor == "scanner" else "y")(angle), step=15.0) for angle in _YAWS_DEG]
     for unit, metres in UNITS.items():
         said = f"the translation in to_vehicle of {{name}} is in {unit}: give metres"
-        found.append(_mounting(sensor, said, partial(_rescaled, metres=metres)))
+        found.append(_mounting(sensor, said, lambda given, m=metres: rigid(given[:3, :3], given[:3, 3] * m)))
     return found
 
 

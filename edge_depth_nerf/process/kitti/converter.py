@@ -34,19 +34,12 @@ import numpy as np
 
 from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.base.files import picture_head
-from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.cameras.transforms import Transform, check_rigid, rigid
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.process.kitti.calibration import (
-    read_oxts,
-    read_projection,
-    read_rectification,
-    read_rigid,
-    read_transform,
-    read_values,
-)
+from edge_depth_nerf.process.kitti.calibration import matrix_of, read_oxts, read_projection, read_rigid, read_values
 from edge_depth_nerf.process.kitti360.calibration import read_timestamps
 from edge_depth_nerf.process.options import KittiOptions
-from edge_depth_nerf.process.poses import increasing, read_times
+from edge_depth_nerf.process.poses import increasing, read_times, transform_of_rows
 from edge_depth_nerf.process.poses import read_kitti as read_kitti_poses
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.rig import Numbered, recording_of_rig, upright_world
@@ -174,7 +167,10 @@ def _raw(options: KittiOptions) -> _Layout:
     values = read_values(lenses_file)
     lenses = {name: read_projection(values, f"P_rect_{name[-2:]}", lenses_file) for name in options.cameras}
     _check_crop(values, folders, lenses_file)
-    velodyne_to_camera_0 = read_rectification(values, lenses_file) @ read_rigid(velo_file)
+    # from camera 0 to the rectified camera 0
+    turn = rigid(matrix_of(values, "R_rect_00", (3, 3), lenses_file))
+    check_rigid(turn, f"{lenses_file}: R_rect_00")
+    velodyne_to_camera_0 = turn @ read_rigid(velo_file)
     scans = drive / "velodyne_points"
     times_s = increasing(read_timestamps(scans / "timestamps.txt"), scans / "timestamps.txt")
     turn_s = statistics.median(np.diff(times_s).tolist()) if len(times_s) > 1 else 0.1
@@ -237,7 +233,7 @@ def _odometry(options: KittiOptions) -> _Layout:
         lenses={name: read_projection(values, f"P{name[-1]}", calibration) for name in options.cameras},
         folders=folders,
         scans=sequence / "velodyne",
-        velodyne_to_camera_0=read_transform(values, "Tr", calibration),
+        velodyne_to_camera_0=transform_of_rows(matrix_of(values, "Tr", (3, 4), calibration), f"{calibration}: Tr"),
         camera_0_to_vehicle=np.eye(4),
         scanner={"corrected_to": "timestamp"},
         poses_file=poses_file,
