@@ -63,9 +63,9 @@ from edge_depth_nerf.process.kitti360.calibration import (
     read_mei_camera,
     read_poses,
     read_rig,
-    read_timestamps,
 )
 from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions
+from edge_depth_nerf.process.poses import read_frame_times
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.scene.reader import read_scene
 from edge_depth_nerf.scene.writer import ProcessReport, Skipped
@@ -739,7 +739,7 @@ def test_chain_of_frames(drive: RoomDrive) -> None:
 def test_timestamps_keep_fractions_of_a_microsecond(tmp_path: Path) -> None:
     path = tmp_path / "timestamps.txt"
     path.write_text("1970-01-02 00:00:01.123456789\n1970-01-02 00:00:02\n\n")
-    first, second = read_timestamps(path)
+    first, second = read_frame_times(path)
     assert first == pytest.approx(86401.123456789, abs=1e-9)
     assert second == 86402.0
 

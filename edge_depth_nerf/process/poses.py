@@ -7,7 +7,7 @@ names the file and the line.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from datetime import datetime, timezone
 from itertools import pairwise
 from pathlib import Path
@@ -153,6 +153,11 @@ def read_times(path: Path, unit: str = "s") -> list[tuple[str | None, float]]:
     found: list[tuple[str | None, float]] = []
     first = ""
     for line, words in _lines(path):
+        if first == "date" and seconds_of_date(text := " ".join(words)) is None:
+            raise InputError(
+                f"{path}, line {line}: {shown(text)} is not a time like 2013-05-28 08:46:02.123456789, as the lines "
+                "before it. Copy the file again."
+            )
         form, name, time = _time_of_line(words, f"{path}, line {line}")
         if form == "date" and unit != "s":
             raise InputError(
@@ -169,12 +174,14 @@ def read_times(path: Path, unit: str = "s") -> list[tuple[str | None, float]]:
     return found
 
 
-def increasing(times_s: Sequence[float], path: Path, otherwise: str = "") -> Sequence[float]:
-    """Check the times of a data set's frames, a line each; what else may be done than to copy the file again.
+def read_frame_times(path: Path, otherwise: str = "") -> list[float]:
+    """Read the times of a data set's frames, a line each; `otherwise`: what else to do than to copy the file again.
 
     Raises:
-        InputError: one is not after the one before.
+        FileNotFoundError: there is no such file.
+        InputError: a line is no time, or not after the one before.
     """
+    times_s = [time for _, time in read_times(path)]
     for line, (before, time) in enumerate(pairwise(times_s), 2):
         if not time > before:
             raise InputError(

@@ -37,9 +37,8 @@ from edge_depth_nerf.base.files import picture_head
 from edge_depth_nerf.cameras.transforms import Transform, check_rigid, rigid
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.kitti.calibration import matrix_of, read_oxts, read_projection, read_rigid, read_values
-from edge_depth_nerf.process.kitti360.calibration import read_timestamps
 from edge_depth_nerf.process.options import KittiOptions
-from edge_depth_nerf.process.poses import increasing, read_times, transform_of_rows
+from edge_depth_nerf.process.poses import read_frame_times, transform_of_rows
 from edge_depth_nerf.process.poses import read_kitti as read_kitti_poses
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.rig import Numbered, recording_of_rig, upright_world
@@ -172,11 +171,12 @@ def _raw(options: KittiOptions) -> _Layout:
     check_rigid(turn, f"{lenses_file}: R_rect_00")
     velodyne_to_camera_0 = turn @ read_rigid(velo_file)
     scans = drive / "velodyne_points"
-    times_s = increasing(read_timestamps(scans / "timestamps.txt"), scans / "timestamps.txt")
+    times_file = scans / "timestamps.txt"
+    times_s = read_frame_times(times_file)
     turn_s = statistics.median(np.diff(times_s).tolist()) if len(times_s) > 1 else 0.1
     return _Layout(
         calibration=(lenses_file, velo_file, imu_file),
-        times_file=scans / "timestamps.txt",
+        times_file=times_file,
         times_s=times_s,
         lenses=lenses,
         folders=folders,
@@ -229,7 +229,7 @@ def _odometry(options: KittiOptions) -> _Layout:
     return _Layout(
         calibration=(calibration,),
         times_file=times_file,
-        times_s=increasing([time for _, time in read_times(times_file)], times_file),
+        times_s=read_frame_times(times_file),
         lenses={name: read_projection(values, f"P{name[-1]}", calibration) for name in options.cameras},
         folders=folders,
         scans=sequence / "velodyne",

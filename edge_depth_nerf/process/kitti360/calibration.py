@@ -16,7 +16,7 @@ from edge_depth_nerf.base.bounds import shown, text_lines
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import MEI
 from edge_depth_nerf.cameras.transforms import Transform
-from edge_depth_nerf.process.poses import finite_number, seconds_of_date, transform_of_rows
+from edge_depth_nerf.process.poses import finite_number, transform_of_rows
 from edge_depth_nerf.process.recording import RecordedCamera
 
 _MEI_FIELDS = {
@@ -158,27 +158,6 @@ def read_poses(path: Path) -> dict[int, Transform]:
     if not poses:
         raise InputError(f"{path}: no poses in it. {_DOWNLOAD}")
     return poses
-
-
-def read_timestamps(path: Path) -> list[float]:
-    """Read timestamps.txt: line i holds "2013-05-28 08:46:02.123456789" for frame i.
-
-    Returns:
-        Seconds since 1970, the times read as UTC; to some 0.2 µs.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: a line is not a time.
-    """
-    times = []
-    for number, line in _lines(path):
-        time = seconds_of_date(line)
-        if time is None:
-            raise InputError(
-                f"{path}, line {number}: {shown(line)} is not a time like 2013-05-28 08:46:02.123456789. {_DOWNLOAD}"
-            )
-        times.append(time)
-    return times
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:

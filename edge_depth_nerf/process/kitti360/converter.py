@@ -28,9 +28,9 @@ from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.lidar import SweepTiming, check_sweep_size, read_sweep
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.process.kitti360.calibration import read_poses, read_rig, read_timestamps
+from edge_depth_nerf.process.kitti360.calibration import read_poses, read_rig
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.process.poses import increasing, transform_of_rows
+from edge_depth_nerf.process.poses import read_frame_times, transform_of_rows
 from edge_depth_nerf.process.reading import load_distance, load_picture
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.scene.checks import Tolerance, check_distance, check_size, require_folder
@@ -332,8 +332,7 @@ class Kitti360Drive:
         path = self.timestamps_file(camera)
         if not path.is_file():
             return []
-        times = read_timestamps(path)
-        increasing(times, path, ", or move it away: frames then count as 0.1 s apart")
+        times = read_frame_times(path, ", or move it away: frames then count as 0.1 s apart")
         if missing := [frame for frame in frames if frame >= len(times)]:
             raise InputError(
                 f"{path}: ends after line {len(times)}, but frame {missing[0]} needs line {missing[0] + 1}. The file "
