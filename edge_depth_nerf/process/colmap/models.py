@@ -394,21 +394,18 @@ class _Run:
 
     def map(self) -> None:
         """Find poses and points with fixed lenses; by the number of points that gives more pictures their pose."""
-        kept, most = self.folder / "models.kept", -1
-        shutil.rmtree(kept, ignore_errors=True)
+        tried: dict[Path, int] = {}
         for pose_points in _POSE_POINTS:
-            unfinished = self._map(pose_points)
-            placed = {index for model in self.read_models(unfinished) for index in model.placed()}
-            if len(placed) > most:
-                shutil.rmtree(kept, ignore_errors=True)
-                os.replace(unfinished, kept)
-                most = len(placed)
-            if most >= _ENOUGH * len(self.names):
+            made = self._map(pose_points)
+            tried[made] = len({index for model in self.read_models(made) for index in model.placed()})
+            if tried[made] >= _ENOUGH * len(self.names):
                 break
-        write_json(self.folder / _MODELS_SUM, {"sha256": sum_of_files(kept)})
+        best = max(tried, key=lambda made: tried[made])
+        write_json(self.folder / _MODELS_SUM, {"sha256": sum_of_files(best)})
         shutil.rmtree(self.models, ignore_errors=True)
-        os.replace(kept, self.models)
-        shutil.rmtree(self.folder / "models.unfinished", ignore_errors=True)
+        os.replace(best, self.models)
+        for unfinished in self.folder.glob("models.[0-9]*"):
+            shutil.rmtree(unfinished, ignore_errors=True)
 
     def _map(self, pose_points: int) -> Path:
         """Run COLMAP's mapper; gives the folder with what it wrote."""
@@ -433,7 +430,7 @@ class _Run:
         options.mapper.init_min_tri_angle = 8.0
         options.triangulation.merge_max_reproj_error = error_px
         options.triangulation.complete_max_reproj_error = error_px
-        unfinished = self.folder / "models.unfinished"
+        unfinished = self.folder / f"models.{pose_points}"
         shutil.rmtree(unfinished, ignore_errors=True)
         unfinished.mkdir()
         with progress_bars(self.console, counted=True) as progress:
