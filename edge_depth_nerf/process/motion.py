@@ -9,7 +9,6 @@ until all maps are written, so that a stopped run resumes where it stopped.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import io
@@ -75,29 +74,26 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     numbers = {picture.name: index for index, picture in enumerate(pictures)}
     shares: list[float] = []
 
-    def around(index: int) -> MotionDistance:
+    def around(index: int) -> Float32[np.ndarray, "_ _"]:
         neighbours = motion.neighbours(index)
         theirs = [store.confirmed(other).distance_m for other in neighbours]
-        seen_m = seen_around(motion.view(index), [motion.view(other) for other in neighbours], theirs)
-        return dataclasses.replace(store.confirmed(index), distance_m=seen_m)
+        return seen_around(motion.view(index), [motion.view(other) for other in neighbours], theirs)
 
     def maps(layer: str) -> Iterator[tuple[str, Float32[np.ndarray, "_ _"]]]:
         for picture in scene.pictures:
-            size = (picture.lens.height, picture.lens.width)
-            if picture.held_out:
-                yield picture.name, np.zeros(size, np.float32)
-                continue
-            index, factor = numbers[picture.name], working_factor(picture.lens)
-            if layer == "motion_around":
-                yield picture.name, enlarged(around(index), factor, size)
-                continue
-            found = store.confirmed(index)
-            if layer == "motion_sigma":
-                yield picture.name, enlarged_sigma(found, factor, size)
-                continue
-            used = motion.view(index).used
-            shares.append(float((found.distance_m > 0).sum() / max(1, used.sum())))
-            yield picture.name, enlarged(found, factor, size)
+            size, factor = (picture.lens.height, picture.lens.width), working_factor(picture.lens)
+            index = numbers.get(picture.name)
+            if index is None:
+                map_ = np.zeros(size, np.float32)
+            elif layer == "motion_around":
+                map_ = enlarged(around(index), factor, size)
+            elif layer == "motion_sigma":
+                map_ = enlarged_sigma(store.confirmed(index), factor, size)
+            else:
+                distance_m, used = store.confirmed(index).distance_m, motion.view(index).used
+                shares.append(float((distance_m > 0).sum() / max(1, used.sum())))
+                map_ = enlarged(distance_m, factor, size)
+            yield picture.name, map_
 
     source = {"kind": OWN_MOTION}
     with progress_bars(console) as progress:
@@ -111,12 +107,12 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     say(console, f"{said}.", "yellow" if still else None)
 
 
-def enlarged(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
+def enlarged(distance_m: Float32[np.ndarray, "_ _"], factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
     """Bring distances to a picture's size (height, width): interpolated on surfaces, else the nearest; 0 = none."""
     if factor == 1:
-        return found.distance_m
-    kept = found.distance_m > 0
-    inverse = np.where(kept, 1 / np.where(kept, found.distance_m, 1), np.nan).astype(np.float32)
+        return distance_m
+    kept = distance_m > 0
+    inverse = np.where(kept, 1 / np.where(kept, distance_m, 1), np.nan).astype(np.float32)
     whole = (inverse.shape[1] * factor, inverse.shape[0] * factor)
     nearest = np.asarray(cv2.resize(inverse, whole, interpolation=cv2.INTER_NEAREST))
     between = np.asarray(cv2.resize(inverse, whole, interpolation=cv2.INTER_LINEAR))

@@ -305,14 +305,10 @@ class _Unpacking:
 
     def _vehicle(self, fixed: dict[Edge, Transform], moving: dict[Edge, Poses]) -> str:
         """The frame that all is mounted on."""
-        if self._options.vehicle is not None:
-            return self._options.vehicle
-        if self._child:
-            return self._child
         known = {frame for edge in (*fixed, *moving) for frame in edge}
-        named = next((frame for frame in VEHICLE_FRAMES if frame in known), None)
-        sensors = [*self._found.scanners, *self._found.cameras]
-        return named or next((sensor.frame for sensor in sensors if sensor.frame), "vehicle")
+        named = [frame for frame in VEHICLE_FRAMES if frame in known]
+        mounted = [sensor.frame for sensor in (*self._found.scanners, *self._found.cameras)]
+        return next(filter(None, (self._options.vehicle, self._child, *named, *mounted)), "vehicle")
 
     def _write_poses(self, vehicle: str, fixed: dict[Edge, Transform], moving: dict[Edge, Poses]) -> str | None:
         """Write the poses of the vehicle; say what they are, None without any."""

@@ -61,6 +61,8 @@ class _Layout:
     times_s: Sequence[float]
     lenses: dict[str, tuple[dict[str, float], Transform]]
     """Of the cameras: their numbers, and from their frames to the rectified camera 0."""
+    sizes: dict[str, list[int]]
+    """Width and height of their pictures, where the calibration has them."""
     folders: dict[str, Path]
     """Of the cameras' pictures."""
     scans: Path
@@ -125,6 +127,12 @@ def _description(layout: _Layout, options: KittiOptions) -> dict[str, Any]:
         if first is None:
             raise FileNotFoundError(f"{layout.folders[name]}: no .png; the pictures of {name} belong there.")
         width, height, *_ = picture_head(first)
+        # it differs from day to day
+        if layout.sizes and (size := layout.sizes[name]) != [width, height]:
+            raise InputError(
+                f"{layout.calibration[0]}: S_rect_{name[-2:]} is {'×'.join(map(str, size)) or 'missing'}, but {first} "
+                f"has {width}×{height} pixels. The calibration is of another day, or the pictures were resized."
+            )
         cameras[name] = {
             **{"images": str(layout.folders[name].relative_to(options.root)), "times_file": times_file},
             **{"model": "pinhole", "width": width, "height": height, **lens, "to_vehicle": mounted(to_camera_0)},
@@ -165,7 +173,6 @@ def _raw(options: KittiOptions) -> _Layout:
     )
     values = read_values(lenses_file)
     lenses = {name: read_projection(values, f"P_rect_{name[-2:]}", lenses_file) for name in options.cameras}
-    _check_crop(values, folders, lenses_file)
     # from camera 0 to the rectified camera 0
     turn = rigid(matrix_of(values, "R_rect_00", (3, 3), lenses_file))
     check_rigid(turn, f"{lenses_file}: R_rect_00")
@@ -179,6 +186,7 @@ def _raw(options: KittiOptions) -> _Layout:
         times_file=times_file,
         times_s=times_s,
         lenses=lenses,
+        sizes={name: values.get(f"S_rect_{name[-2:]}", np.zeros(0)).astype(int).tolist() for name in options.cameras},
         folders=folders,
         scans=scans / "data",
         velodyne_to_camera_0=velodyne_to_camera_0,
@@ -187,22 +195,6 @@ def _raw(options: KittiOptions) -> _Layout:
         poses_file=drive / "oxts" / "data",
         poses=lambda: read_oxts(drive / "oxts" / "data"),
     )
-
-
-def _check_crop(values: dict[str, np.ndarray], folders: dict[str, Path], path: Path) -> None:
-    """Check that the calibration is of the pictures' size, which differs from day to day.
-
-    Raises:
-        InputError: it is of another one.
-    """
-    for name, folder in folders.items():
-        size = values.get(f"S_rect_{name[-2:]}", np.zeros(0)).astype(int).tolist()
-        first = min(folder.glob("*.png"), default=None)
-        if first is not None and (there := list(picture_head(first)[:2])) != size:
-            raise InputError(
-                f"{path}: S_rect_{name[-2:]} is {'×'.join(map(str, size)) or 'missing'}, but {first} has "
-                f"{'×'.join(map(str, there))} pixels. The calibration is of another day, or the pictures were resized."
-            )
 
 
 def _odometry(options: KittiOptions) -> _Layout:
@@ -231,6 +223,7 @@ def _odometry(options: KittiOptions) -> _Layout:
         times_file=times_file,
         times_s=read_frame_times(times_file),
         lenses={name: read_projection(values, f"P{name[-1]}", calibration) for name in options.cameras},
+        sizes={},
         folders=folders,
         scans=sequence / "velodyne",
         velodyne_to_camera_0=transform_of_rows(matrix_of(values, "Tr", (3, 4), calibration), f"{calibration}: Tr"),
