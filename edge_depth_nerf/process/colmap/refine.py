@@ -18,7 +18,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
@@ -87,11 +86,6 @@ class Refinement:
     checks: int
     """How many matches these medians are of."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
-        arrays = {"vehicle_to_world": self.vehicle_to_world.tolist(), "supported": self.supported.tolist()}
-        return {**vars(self), **arrays}
-
 
 def refine_poses(recording: Recording, options: ProcessOptions, console: Console) -> Recording:
     """Move the poses of a recording to where its pictures agree with them, and with each other, best.
@@ -126,7 +120,8 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
         matches = _match(recording, shots, given, options, console)
         with console.status("Refining the poses …"):
             found = refine(pycolmap, shots, matches, given, reshoot=reshoot)
-        write_json(options.output / REFINED_POSES, {"digest": digest, **found.to_dict()})
+        arrays = {"vehicle_to_world": found.vehicle_to_world.tolist(), "supported": found.supported.tolist()}
+        write_json(options.output / REFINED_POSES, {"digest": digest, **vars(found), **arrays})
     if found.checks < _LEAST_CHECKS:
         return _kept(recording, f"only {found.checks} features could be matched for the check")
     distances = f"{found.before_px:.2f} px before, {found.after_px:.2f} px after"

@@ -66,22 +66,16 @@ def read_kitti360(options: Kitti360Options) -> Recording:
     kept = [(name, frame) for name, frame in kept if frame in whole]
     if not kept:
         raise InputError(f"{tolerance.left_out[0].fault} No other frame is chosen: choose more by --frames.")
-    files = {}
-    for name, frame in kept:
-        with tolerance.of(frame, name):
-            files[name, frame] = drive.check_picture(cameras[name], frame)
     frames = sorted({frame for _, frame in kept})
     stamps = {name: drive.read_timestamps(name, frames) for name in options.cameras}
     clock = _Clock(next((times for times in stamps.values() if times), []))
-
-    pictures = tuple(
-        picture(
-            time_s=clock.time_s(frame),
-            camera_to_world=None if poses is None else poses[frame] @ cameras[name].to_vehicle,
-            timestamp_s=stamps[name][frame] if stamps[name] else None,
-        )
-        for (name, frame), picture in files.items()
-    )
+    pictures = []
+    for name, frame in kept:
+        pose = None if poses is None else poses[frame] @ cameras[name].to_vehicle
+        stamp = stamps[name][frame] if stamps[name] else None
+        with tolerance.of(frame, name):
+            picture = drive.picture(cameras[name], frame)
+            pictures.append(picture(time_s=clock.time_s(frame), camera_to_world=pose, timestamp_s=stamp))
     timing = SweepTiming(clock.interval_s)
     sweeps = [
         RecordedSweep(
@@ -97,7 +91,7 @@ def read_kitti360(options: Kitti360Options) -> Recording:
     ]
     return Recording(
         cameras=tuple(cameras.values()),
-        pictures=pictures,
+        pictures=tuple(pictures),
         sweeps=tuple(sweeps),
         trajectory=None if poses is None else _trajectory(poses, clock, drive.poses),
         source={
@@ -119,7 +113,7 @@ def read_kitti360(options: Kitti360Options) -> Recording:
             for name, times in stamps.items()
             if not times
         ),
-        shifted=tuple(_shifted_views(drive, cameras, set(files))),
+        shifted=tuple(_shifted_views(drive, cameras, {(picture.camera, picture.frame) for picture in pictures})),
     )
 
 
@@ -287,7 +281,7 @@ class Kitti360Drive:
         """The sweep of a frame."""
         return self.sweeps / f"{frame:010d}.bin"
 
-    def check_picture(self, recorded: RecordedCamera, frame: int) -> partial[RecordedPicture]:
+    def picture(self, recorded: RecordedCamera, frame: int) -> partial[RecordedPicture]:
         """Find a picture and what its maps are made from, and check sizes and headers; time and pose are not set.
 
         Raises:
