@@ -589,8 +589,7 @@ class _Companions:
         self._options = options
         self.turned: dict[str, Counter[int]] = defaultdict(Counter)
         """How many of each camera's pictures have which EXIF orientation, beside those that stand upright."""
-        keys = ("truth_distance", "truth_rgb") if options.mono else ("mono", "truth_distance", "truth_rgb")
-        for key in keys:
+        for key in ("depth", "truth_distance", "truth_rgb", *(() if options.mono else ("mono",))):
             lacking = [camera.name for camera in cameras if getattr(camera, key) is None]
             if 0 < len(lacking) < len(cameras):
                 raise InputError(

@@ -183,8 +183,9 @@ def _read_refinement(path: Path, digest: str) -> Refinement | None:
     if not isinstance(found, dict) or found.get("digest") != digest:
         return None
     del found["digest"]
-    arrays = {"vehicle_to_world": np.array(found["vehicle_to_world"]), "supported": np.array(found["supported"])}
-    return Refinement(**{**found, **arrays})
+    for key in ("vehicle_to_world", "supported"):
+        found[key] = np.array(found[key])
+    return Refinement(**found)
 
 
 # ---- what the pictures share -----------------------------------------------------------------------------------
