@@ -27,12 +27,12 @@ from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.files import read_image, read_json, sha256_of, write_json
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.poses.matches import Matches, PosedPicture, epipolar_distance_px, match_pictures
+from edge_depth_nerf.poses.matches import Matches, epipolar_distance_px, match_pictures
 from edge_depth_nerf.poses.tracks import Tracks, features_joined, join_matches, reprojection_px, spread, triangulate
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, adjust_bundle
 from edge_depth_nerf.process.colmap.models import colmap_lenses, file_stamp, import_pycolmap, pairs_to_match
 from edge_depth_nerf.process.colmap.scale import frame_times
-from edge_depth_nerf.process.feature_masks import FeatureMasks
+from edge_depth_nerf.process.feature_masks import FeatureMasks, posed_pictures
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
@@ -117,7 +117,7 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
     digest = _digest(pycolmap.__version__, recording, options, given)
     found = _read_refinement(options.output / REFINED_POSES, digest)
     if found is None:
-        matches = _match(recording, shots, given, options, console)
+        matches = _match(recording, options, console)
         with console.status("Refining the poses …"):
             found = refine(pycolmap, shots, matches, given, reshoot=reshoot)
         arrays = {"vehicle_to_world": found.vehicle_to_world.tolist(), "supported": found.supported.tolist()}
@@ -202,27 +202,11 @@ def _shots(recording: Recording, frames: Sequence[int], given: Float64[np.ndarra
     ]
 
 
-def _match(
-    recording: Recording,
-    shots: Sequence[Shot],
-    given: Float64[np.ndarray, "frames 4 4"],
-    options: ProcessOptions,
-    console: Console,
-) -> list[Matches]:
+def _match(recording: Recording, options: ProcessOptions, console: Console) -> list[Matches]:
     """Match the pictures that were taken shortly after one another."""
     lenses = colmap_lenses(recording, options)
     masks = FeatureMasks(recording, options, {name: lens.theta_max_rad for name, lens in lenses.items()})
-    posed = [
-        PosedPicture(
-            camera=picture.camera,
-            frame=shot.frame,
-            lens=shot.lens,
-            camera_to_world=pose,
-            read_rgb=partial(_read, picture, shot.lens, options.strict),
-            read_usable=partial(masks.of, picture),
-        )
-        for picture, shot, pose in zip(recording.pictures, shots, _camera_poses(shots, given), strict=True)
-    ]
+    posed = posed_pictures(recording, masks, partial(_read, strict=options.strict))
     pairs = [
         (one, other)
         for one, other in pairs_to_match(recording, lenses, _APART, _ACROSS)
