@@ -477,10 +477,8 @@ class _Candidate:
     given: Transform
     """From the scanner to the vehicle; of maps the camera's."""
     gain: float = -math.inf
-    by_contrast: float = 0.0
-    by_edges: float = 0.0
-    by_sweeps: float = 0.0
-    """Parts of it, before edges are cubed."""
+    gains: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Its parts by contrast, edges and sweeps, before edges are cubed."""
     lack: float = 1.0
     before: float = 1.0
     """The mean lack as given."""
@@ -492,9 +490,8 @@ class _Candidate:
         """Whether it is named."""
         if not self.reading.both:
             return self.gain >= self.reading.clear and self.lack < _FITTING
-        gains = self.by_contrast, self.by_edges, self.by_sweeps
         told = any(
-            all(gain >= least for gain, least in zip(gains, asked, strict=False))
+            all(gain >= least for gain, least in zip(self.gains, asked, strict=False))
             for asked in (_LEAST_GAINS, _LEAST_GAINS_WITH_SWEEPS)
         )
         return self.gain >= self.reading.clear and self.lack < min(_FITTING, _MOVES_SMALL * self.still) and told
@@ -672,21 +669,15 @@ def _tried(
     )
     if lack > _MOVES * still:
         return unfit
-    gain = math.log(before / lack)
+    by_contrast, by_sweeps = math.log(before / lack), 0.0
     steps = [math.log(a.edge / b.edge) for b, a in told if a.edge > 0 and b.edge > 0]
-    step = _within(float(np.mean(steps)), _MOST_BY_EDGES) if steps else 0.0
-    parts = {"by_contrast": gain, "by_edges": step}
-    gain += 3 * step
+    step = float(np.clip(np.mean(steps), -_MOST_BY_EDGES, _MOST_BY_EDGES)) if steps else 0.0
+    gain = by_contrast + 3 * step
     of_sweeps = candidate.sensor == source.name and not reading.scales
-    if apart_m is not None and of_sweeps and gain > -0.2:
-        other_m = source.apart_m(reading)
-        parts["by_sweeps"] = 0.0 if other_m is None else _within(math.log(apart_m / other_m), _MOST_BY_SWEEPS)
-        gain += parts["by_sweeps"]
-    return replace(candidate, gain=gain, lack=lack, before=before, still=still, **parts)
-
-
-def _within(value: float, most: float) -> float:
-    return min(max(value, -most), most)
+    if apart_m is not None and of_sweeps and gain > -0.2 and (other_m := source.apart_m(reading)) is not None:
+        by_sweeps = float(np.clip(math.log(apart_m / other_m), -_MOST_BY_SWEEPS, _MOST_BY_SWEEPS))
+    gains = by_contrast, step, by_sweeps
+    return replace(candidate, gain=gain + by_sweeps, gains=gains, lack=lack, before=before, still=still)
 
 
 def _refined(source: _Source, best: _Candidate, given: dict[_View, _Fit], apart_m: float | None) -> _Candidate:

@@ -110,8 +110,6 @@ class ColmapLens:
     parameters: tuple[float, ...]
     theta_max_rad: float
     """Up to which it is used."""
-    rms_px: float
-    """How far it is from the camera it stands for."""
 
 
 @functools.lru_cache(maxsize=64)
@@ -128,14 +126,10 @@ def colmap_lens(camera: Camera, theta_max_rad: float = math.radians(THETA_MAX_DE
     if isinstance(camera, Pinhole) and not camera.k4:
         k = camera
         parameters = (k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2, k.k3, 0.0, 0.0, 0.0)
-        return ColmapLens("FULL_OPENCV", parameters, limit, 0.0)
-    if isinstance(camera, KannalaBrandt):
-        k, rms = camera, 0.0
-    else:
-        fit = fit_kannala_brandt(camera, limit)
-        k, rms = fit.camera, fit.rms_px
+        return ColmapLens("FULL_OPENCV", parameters, limit)
+    k = camera if isinstance(camera, KannalaBrandt) else fit_kannala_brandt(camera, limit).camera
     parameters = (k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2, k.k3, k.k4, 0.0, 0.0)
-    return ColmapLens("THIN_PRISM_FISHEYE", parameters, limit, rms)
+    return ColmapLens("THIN_PRISM_FISHEYE", parameters, limit)
 
 
 def colmap_lenses(recording: Recording, options: ProcessOptions) -> dict[str, ColmapLens]:

@@ -149,7 +149,7 @@ def read_poses(path: Path) -> dict[int, Transform]:
     poses: dict[int, Transform] = {}
     for number, line in _lines(path):
         first, rest = (*line.split(maxsplit=1), "")[:2]
-        frame = _number(first, path, number)
+        frame = finite_number(first, f"{path}, line {number}", _DOWNLOAD)
         if frame != int(frame) or not 0 <= frame < _MAX_FRAME:
             raise InputError(f"{path}, line {number}: {shown(first)} is not a frame number. {_DOWNLOAD}")
         if int(frame) in poses:
@@ -197,12 +197,8 @@ def _read_yaml(path: Path) -> tuple[dict[str, tuple[int, str]], int]:
     return values, last
 
 
-def _number(text: str, path: Path, line: int) -> float:
-    return finite_number(text, f"{path}, line {line}", _DOWNLOAD)
-
-
 def _transform(text: str, path: Path, line: int) -> Transform:
-    numbers = [_number(word, path, line) for word in text.split()]
+    numbers = [finite_number(word, f"{path}, line {line}", _DOWNLOAD) for word in text.split()]
     if len(numbers) != 12:
         raise InputError(
             f"{path}, line {line}: {len(numbers)} numbers, expected 12 (the 3×4 matrix of rotation and translation, "
