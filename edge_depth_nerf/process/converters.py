@@ -46,6 +46,7 @@ def read_drive(options: ProcessOptions) -> Recording:
         FileNotFoundError: a folder or file of the drive is missing.
         InputError: an option or a file of the drive cannot be used.
     """
+    options.check()
     _, module, reader = CONVERTERS[name_of(options)]
     return getattr(import_module(f"{__package__}.{module}"), reader)(options)
 

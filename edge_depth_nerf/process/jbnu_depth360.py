@@ -33,7 +33,6 @@ def read_jbnu_depth360(options: JbnuDepth360Options) -> Recording:
         FileNotFoundError: a folder or file of the data set is missing.
         InputError: an option or a file of the data set cannot be used.
     """
-    options.check()
     for folder in ("image", "bin"):
         require_folder(options.root / folder, "--root takes a sequence's folder such as 230329/test_1")
     rig = read_rig(options.calibration, options.calibration.parent, _fill_in)

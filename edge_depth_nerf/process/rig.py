@@ -32,7 +32,7 @@ from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_time
 from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.process.rig_file import Clock, Rig, RigCamera, RigLidar, RigPoses, read_rig
-from edge_depth_nerf.scene.checks import Tolerance, check_picture_size, check_size
+from edge_depth_nerf.scene.checks import Tolerance, check_picture_size, check_size, require_folder
 from edge_depth_nerf.scene.writer import Skipped, summarise
 
 _LOOKED_AT = 5
@@ -91,9 +91,7 @@ def read_rig_recording(options: RigOptions) -> Recording:
         FileNotFoundError: a folder or file of the recording is missing.
         InputError: an option or a file of the recording cannot be used.
     """
-    options.check()
-    if not options.root.is_dir():
-        raise FileNotFoundError(f"{options.root}: no such folder; --root takes the recording's folder.")
+    require_folder(options.root, "--root takes the recording's folder")
     there = [options.root / name for name in _RIG_FILES if (options.root / name).is_file()]
     if options.rig is None and len(there) != 1:
         found = " and ".join(path.name for path in there) or "neither"

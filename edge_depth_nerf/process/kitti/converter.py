@@ -86,7 +86,6 @@ def read_kitti(options: KittiOptions) -> Recording:
         FileNotFoundError: a folder or file of the drive is missing.
         InputError: an option or a file of the drive cannot be used.
     """
-    options.check()
     names = options.cameras
     if not (len(set(names)) == len(names) > 0 and set(names) <= set(CAMERAS)):
         raise InputError(f"--cameras {' '.join(names)}: expected some of {', '.join(CAMERAS)}.")

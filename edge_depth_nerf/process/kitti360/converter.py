@@ -200,11 +200,10 @@ class Kitti360Drive:
 
     Raises:
         FileNotFoundError: a folder is missing.
-        InputError: an option is out of its range.
+        InputError: other cameras than the fisheyes are asked for.
     """
 
     def __init__(self, options: Kitti360Options) -> None:
-        options.check()
         names = options.cameras
         if not (len(set(names)) == len(names) > 0 and set(names) <= {"image_02", "image_03"}):
             raise InputError(f"--cameras {' '.join(names)}: expected image_02, image_03 or both.")
