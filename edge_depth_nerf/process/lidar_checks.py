@@ -371,6 +371,7 @@ class _Source:
         assert recording.trajectory is not None
         self.name, self._path = name, recording.trajectory
         self.sweeps = sorted((one for one in recording.sweeps if one.scanner == name), key=lambda one: one.time_s)
+        self._times_s = np.array([one.time_s for one in self.sweeps])
         self._scans: dict[object, _Scan | None] = {}
         self._maps: dict[object, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -399,8 +400,8 @@ class _Source:
     def nearest(self, pair: _Pair, reading: Reading) -> _Scan | None:
         """The sweep of a pair's first picture, if there is one."""
         time_s = pair.pictures[0].time_s + reading.pictures_later_s - reading.scans_later_s
-        recorded = min(self.sweeps, key=lambda one: abs(one.time_s - time_s), default=None)
-        return self.scan(recorded) if recorded and abs(recorded.time_s - time_s) <= _APART_S else None
+        apart_s = np.abs(self._times_s - time_s)
+        return self.scan(self.sweeps[apart_s.argmin()]) if apart_s.min(initial=math.inf) <= _APART_S else None
 
     def points(self, view: _View, pair: _Pair, reading: Reading) -> Float64[np.ndarray, "n 3"] | None:
         """What is seen of the world by a pair."""
@@ -426,8 +427,7 @@ class _Source:
     @cached_property
     def _two_sweeps(self) -> list[tuple[_Points, _Points]]:
         """Pairs of sweeps between which the vehicle has moved."""
-        places = self._path.at(np.array([one.time_s for one in self.sweeps]))[:, :3, 3]
-        pairs = _pairs_apart(places, _SWEEPS_MOVED_M)
+        pairs = _pairs_apart(self._path.at(self._times_s)[:, :3, 3], _SWEEPS_MOVED_M)
         found = []
         for index in spread_over(len(pairs), 3):
             scans = [self.scan(self.sweeps[one]) for one in pairs[index]]
