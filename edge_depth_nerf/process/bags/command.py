@@ -115,12 +115,9 @@ def _list(bag: Bag, found: Survey, console: Console) -> None:
     console.print(table)
     for scanner in found.scanners:
         if scanner.times is not None:
-            counted = {"stamp": "the scan's stamp", "1970": "1970", "first": "the first point"}
-            since = counted[scanner.times.counted_from]
-            say(
-                console,
-                f"{scanner.name}: points have times: {scanner.times.field}, in {scanner.times.unit} from {since}",
-            )
+            times, counted = scanner.times, {"stamp": "the scan's stamp", "1970": "1970", "first": "the first point"}
+            since = f"{times.field}, in {times.unit} from {counted[times.counted_from]}"
+            say(console, f"{scanner.name}: points have times: {since}")
         if scanner.note:
             say(console, f"{scanner.name}: {scanner.note}", "yellow")
     for camera in found.cameras:
