@@ -30,7 +30,7 @@ from edge_depth_nerf.synthetic.options import SynthesizeOptions
 if TYPE_CHECKING:
     Converter = ProcessOptions
 else:
-    _members = tuple(Annotated[each.options, tyro.conf.subcommand(name)] for name, each in CONVERTERS.items())
+    _members = tuple(Annotated[options, tyro.conf.subcommand(name)] for name, (options, *_) in CONVERTERS.items())
     Converter = Union[_members]  # noqa: UP007
 
 

@@ -45,10 +45,9 @@ from edge_depth_nerf.process.kitti360.calibration import (
     read_cam_to_velo,
     read_mei_camera,
     read_poses,
-    read_timestamps,
 )
 from edge_depth_nerf.process.options import RigOptions
-from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_times, read_tum
+from edge_depth_nerf.process.poses import read_frame_times, read_kitti, read_nerfstudio, read_times, read_tum
 from edge_depth_nerf.process.rig import read_rig_recording
 from edge_depth_nerf.process.rig_file import read_rig
 from edge_depth_nerf.scene.reader import read_scene
@@ -233,7 +232,7 @@ OURS: dict[str, Reader] = {
     ),
     "kitti cam to velo": Reader(named("a.txt", CAM0_TO_VELO + "\n"), read_cam_to_velo),
     "kitti poses": Reader(named("a.txt", POSES), read_poses),
-    "kitti timestamps": Reader(named("a.txt", TIMES), read_timestamps),
+    "kitti timestamps": Reader(named("a.txt", TIMES), read_frame_times),
     "tum": Reader(named("a.txt", TUM), read_tum),
     "poses of 12 numbers": Reader(named("a.txt", f"{IDENTITY}\n" * 5), read_kitti),
     "poses of nerfstudio": Reader(named("a.json", json.dumps(FRAMES)), read_nerfstudio, "json"),

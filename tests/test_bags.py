@@ -280,9 +280,9 @@ def test_bags_without_pictures_and_with_unknown_types(tmp_path: Path) -> None:
 def test_folders_that_hold_something_else(whole: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     (tmp_path / "other/thesis.tex").write_text("mine")
-    with pytest.raises(InputError, match=r"not an unpacked bag \(thesis\.tex\)"):
+    with pytest.raises(InputError, match=r"holds something else \(thesis\.tex\)"):
         run(whole[0], tmp_path / "other")
-    with pytest.raises(InputError, match="contains another bag, or one unpacked with other options"):
+    with pytest.raises(InputError, match=r"holds other unpacked bags \(options differs\)"):
         run(whole[0], whole[1], seconds=0.5)
     (tmp_path / "file").write_text("mine")
     with pytest.raises(InputError, match="is a file"):
@@ -456,7 +456,7 @@ def test_bayer(pattern: str, bits: int) -> None:
     compressed = SimpleNamespace(format=f"bayer_{pattern}8; png compressed ", data=content.ravel())
     assert pictures.why_no_picture(compressed) is None
     assert pictures.file_of(compressed, 8)[0] == ".png"
-    developed = pictures._developed(content.tobytes(), pictures._BAYER[pattern]).astype(int)
+    developed = pictures._developed(content.tobytes(), pictures._PATTERNS[pattern]).astype(int)
     assert np.abs(developed - RGB)[2:-2, 2:-2].max() <= 2
 
 

@@ -140,8 +140,7 @@ def test_poses_are_refined_without_its_pictures(drive, tmp_path, monkeypatch):
         asked = options(drive, tmp_path, holdout_cameras=held_out)
         recording = read_drive(asked)
         given = np.stack([drive.poses[frame] for frame in drive.frames])
-        shots = refining._shots(recording, drive.frames, given)
-        assert refining._match(recording, shots, given, asked, QUIET) == []
+        assert refining._match(recording, asked, QUIET) == []
     assert seen == [{KEPT, HELD_OUT}, {KEPT}]
     digests = {
         refining._digest("1", recording, options(drive, tmp_path, holdout_cameras=names), given)

@@ -246,12 +246,11 @@ def test_process_finds_motion_once_unless_told_not_to(tmp_path: Path) -> None:
 def test_maps_are_enlarged_on_surfaces_and_kept_apart_at_jumps() -> None:
     distance = np.zeros((3, 6), np.float32)
     distance[:2] = [4.0, 4.1, 4.2, 9.0, 9.0, 9.0]
-    found = MotionDistance(distance, distance, distance)
-    large = enlarged(found, 2, (7, 13))
+    large = enlarged(distance, 2, (7, 13))
     assert large.shape == (7, 13)
     assert not large[4:].any() and not large[:, 12].any()
     # between blocks' centres a quarter of the way, in inverse distance
     assert large[1, 1] == pytest.approx(1 / (0.75 / 4.0 + 0.25 / 4.1), rel=1e-5)
     np.testing.assert_allclose(large[:4, 5], 4.2, rtol=0.02)
     np.testing.assert_allclose(large[:4, 6], 9.0, rtol=1e-6)
-    assert enlarged(found, 1, (3, 6)) is distance
+    assert enlarged(distance, 1, (3, 6)) is distance

@@ -208,9 +208,9 @@ def test_noisy_pictures_name_small_faults(
 def test_a_small_fault_is_told_by_contrast_and_edges_or_with_sweeps(
     by_contrast: float, by_edges: float, by_sweeps: float, clear: bool
 ) -> None:
-    gains = {"by_contrast": by_contrast, "by_edges": by_edges, "by_sweeps": by_sweeps}
+    gains = by_contrast, by_edges, by_sweeps
     reading = Reading(both=True, clear=0.2)
-    assert lidar_checks._Candidate(reading, "roof", (), np.eye(4), 1.0, **gains, lack=0.1, still=0.5).clear is clear
+    assert lidar_checks._Candidate(reading, "roof", (), np.eye(4), 1.0, gains, lack=0.1, still=0.5).clear is clear
 
 
 def test_point_times_that_count_backwards_are_named(brief: Recording) -> None:

@@ -473,7 +473,8 @@ def open_folder(output: Path, record_path: Path, record: dict[str, Any], what: s
             raise InputError(
                 f"{output}: holds other {what} ({differing[0]} differs). Give another --output, or delete that folder."
             )
-    elif output.is_dir() and any(output.iterdir()):
-        raise InputError(f"{output}: holds something else. Give another --output, or empty that folder.")
+    elif output.is_dir() and (names := sorted(entry.name for entry in output.iterdir())):
+        some = f"{', '.join(names[:5])}{', …' if len(names) > 5 else ''}"
+        raise InputError(f"{output}: holds something else ({some}). Give another --output, or empty that folder.")
     else:
         write_json(record_path, record)

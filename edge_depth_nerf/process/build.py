@@ -348,12 +348,8 @@ class _Builder:
         """What of the picture holds still, as far as that is given."""
         if "mask" not in self.layers:
             return None
-        mask = np.ones((camera.height, camera.width), bool)
-        if picture.mask is not None:
-            mask &= read_camera_mask(picture.mask, camera)
-        if picture.moving_mask is not None:
-            mask &= read_camera_mask(picture.moving_mask, camera)
-        return mask
+        masks = [read_camera_mask(path, camera) for path in (picture.mask, picture.moving_mask) if path is not None]
+        return np.all([np.ones((camera.height, camera.width), bool), *masks], axis=0)
 
     def _lidar(
         self, picture: RecordedPicture, full: Camera, image: UInt8[np.ndarray, "h w 3"]

@@ -6,7 +6,6 @@ in a module that imports little (`process/options.py`, or the head of the conver
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -25,30 +24,19 @@ if TYPE_CHECKING:
     from edge_depth_nerf.scene.writer import ProcessReport
 
 
-@dataclass(frozen=True)
-class Converter:
-    """What reads one kind of drive."""
-
-    options: type[ProcessOptions]
-    """Its options, with `root`, the drive's folder."""
-    module: str
-    """In this folder."""
-    reader: str
-    """Its function that takes the options and gives a Recording."""
-
-
-CONVERTERS: dict[str, Converter] = {
-    "kitti360": Converter(Kitti360Options, "kitti360.converter", "read_kitti360"),
-    "kitti": Converter(KittiOptions, "kitti.converter", "read_kitti"),
-    "jbnu-depth360": Converter(JbnuDepth360Options, "jbnu_depth360", "read_jbnu_depth360"),
-    "rig": Converter(RigOptions, "rig", "read_rig_recording"),
+CONVERTERS: dict[str, tuple[type[ProcessOptions], str, str]] = {
+    "kitti360": (Kitti360Options, "kitti360.converter", "read_kitti360"),
+    "kitti": (KittiOptions, "kitti.converter", "read_kitti"),
+    "jbnu-depth360": (JbnuDepth360Options, "jbnu_depth360", "read_jbnu_depth360"),
+    "rig": (RigOptions, "rig", "read_rig_recording"),
 }
-"""By the name of the command."""
+"""By the name of the command: the options, with `root`, the drive's folder; and the module in this folder with the
+function that takes them and gives a Recording."""
 
 
 def name_of(options: ProcessOptions) -> str:
     """The command that takes these options."""
-    return next(name for name, converter in CONVERTERS.items() if type(options) is converter.options)
+    return next(name for name, (kind, *_) in CONVERTERS.items() if type(options) is kind)
 
 
 def read_drive(options: ProcessOptions) -> Recording:
@@ -58,8 +46,9 @@ def read_drive(options: ProcessOptions) -> Recording:
         FileNotFoundError: a folder or file of the drive is missing.
         InputError: an option or a file of the drive cannot be used.
     """
-    converter = CONVERTERS[name_of(options)]
-    return getattr(import_module(f"{__package__}.{converter.module}"), converter.reader)(options)
+    options.check()
+    _, module, reader = CONVERTERS[name_of(options)]
+    return getattr(import_module(f"{__package__}.{module}"), reader)(options)
 
 
 def convert(options: ProcessOptions, console: Console | None = None) -> ProcessReport:

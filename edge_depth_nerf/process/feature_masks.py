@@ -1,15 +1,17 @@
-"""Where the pictures of a recording may be searched for features."""
+"""The pictures of a recording as they are searched for features, and where."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.masks.lens import lens_circle
+from edge_depth_nerf.poses.matches import PosedPicture
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
@@ -41,3 +43,21 @@ class FeatureMasks:
             return shared
         own = read_if_whole(partial(read_camera_mask, picture.mask, recorded.camera), strict=self._options.strict)
         return np.zeros_like(shared) if own is None else shared & own
+
+
+def posed_pictures(
+    recording: Recording, masks: FeatureMasks, read: Callable[[RecordedPicture, Camera], NDArray[np.uint8]]
+) -> list[PosedPicture]:
+    """The pictures of a recording with a path; `read` reads one of a camera."""
+    lenses = {camera.name: camera.camera for camera in recording.cameras}
+    return [
+        PosedPicture(
+            camera=picture.camera,
+            frame=picture.frame,
+            lens=lenses[picture.camera],
+            camera_to_world=recording.pose(picture),
+            read_rgb=partial(read, picture, lenses[picture.camera]),
+            read_usable=partial(masks.of, picture),
+        )
+        for picture in recording.pictures
+    ]

@@ -33,7 +33,6 @@ def read_jbnu_depth360(options: JbnuDepth360Options) -> Recording:
         FileNotFoundError: a folder or file of the data set is missing.
         InputError: an option or a file of the data set cannot be used.
     """
-    options.check()
     for folder in ("image", "bin"):
         require_folder(options.root / folder, "--root takes a sequence's folder such as 230329/test_1")
     rig = read_rig(options.calibration, options.calibration.parent, _fill_in)
@@ -48,31 +47,25 @@ def _fill_in(content: dict[str, Any]) -> None:
     cameras = cameras if isinstance(cameras, dict) else {}
     for name, camera in cameras.items():
         if isinstance(camera, dict):
-            camera.setdefault("model", "kannala-brandt")
-            camera.setdefault("width", 1920)
-            camera.setdefault("height", 1080)
-            camera.setdefault("images", "image" if len(cameras) == 1 else f"image/{name}")
-            _fill_in_clock(camera)
+            images = "image" if len(cameras) == 1 else f"image/{name}"
+            _add(camera, model="kannala-brandt", width=1920, height=1080, images=images)
     # the vehicle's frame is the scanner's, if the file does not say otherwise
     identity = [[float(row == column) for column in range(4)] for row in range(4)]
     lidars = content.setdefault("lidars", {SCANNER: {}})
     for lidar in lidars.values() if isinstance(lidars, dict) else ():
         if isinstance(lidar, dict):
-            lidar.setdefault("to_vehicle", identity)
-            lidar.setdefault("scans", "bin")
-            _fill_in_clock(lidar)
-            if "point_times" not in lidar:
-                lidar.setdefault("turn_s", 1 / RATE_HZ)
-                lidar.setdefault("timestamp", "middle")
-                if "corrected_to" not in lidar:
-                    lidar.setdefault("direction", "clockwise")
+            turn = {} if "point_times" in lidar else {"turn_s": 1 / RATE_HZ, "timestamp": "middle"}
+            turned = {} if {"point_times", "corrected_to"} & lidar.keys() else {"direction": "clockwise"}
+            _add(lidar, to_vehicle=identity, scans="bin", **turn, **turned)
     poses = content.get("poses")
     if isinstance(poses, dict):
         poses.setdefault("format", "tum")
         if poses["format"] == "kitti":
-            _fill_in_clock(poses)
+            _add(poses)
 
 
-def _fill_in_clock(sensor: dict[str, Any]) -> None:
-    if not {"times_file", "times_from_names", "rate_hz"} & sensor.keys():
-        sensor["rate_hz"] = RATE_HZ
+def _add(table: dict[str, Any], **known: Any) -> None:
+    """Add what a table does not say, and its clock."""
+    if not {"times_file", "times_from_names", "rate_hz"} & table.keys():
+        table["rate_hz"] = RATE_HZ
+    table.update({**known, **table})

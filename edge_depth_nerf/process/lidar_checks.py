@@ -22,8 +22,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
 
 import cv2
 import numpy as np
@@ -148,23 +148,22 @@ class _Points:
     in_scanner: Float64[np.ndarray, "n 3"]
     offset_s: Float64[np.ndarray, "n"]
     sweep: RecordedSweep
-    _given: list[Float64[np.ndarray, "n 3"]] = field(default_factory=list)
-    """Where they are as given, once that was asked."""
+    path: Trajectory
 
-    def world(self, reading: Reading, path: Trajectory) -> Float64[np.ndarray, "n 3"]:
+    def world(self, reading: Reading) -> Float64[np.ndarray, "n 3"]:
         """Where they are, read in another way."""
-        if reading.keeps_scans:
-            # most readings of cameras: found once
-            if not self._given:
-                self._given.append(self._placed(reading, path))
-            return self._given[0]
-        return self._placed(reading, path)
+        # most readings of cameras keep the scans: found once
+        return self._given if reading.keeps_scans else self._placed(reading)
 
-    def _placed(self, reading: Reading, path: Trajectory) -> Float64[np.ndarray, "n 3"]:
+    @cached_property
+    def _given(self) -> Float64[np.ndarray, "n 3"]:
+        return self._placed(Reading())
+
+    def _placed(self, reading: Reading) -> Float64[np.ndarray, "n 3"]:
         offset_s = self.offset_s if reading.point_times is None else reading.point_times(self.offset_s)
         times_s = torch.from_numpy(self.sweep.time_s + reading.scans_later_s + offset_s)
         in_vehicle = torch.from_numpy(_moved(reading.scanner(self.sweep.to_vehicle), self.in_scanner))
-        return (path if reading.path is None else reading.path(path)).to_world(in_vehicle, times_s).numpy()
+        return (self.path if reading.path is None else reading.path(self.path)).to_world(in_vehicle, times_s).numpy()
 
 
 @dataclass(frozen=True)
@@ -255,18 +254,30 @@ def _steps(points: Float64[np.ndarray, "n 3"]) -> np.ndarray:
     return order[found]
 
 
+def _pairs_apart(places: Float64[np.ndarray, "n 3"], far_m: float) -> list[tuple[int, int]]:
+    """Some of the places, spread over the drive, each with the next one that is so far away: indices."""
+    pairs = []
+    for first in spread_over(len(places), _TRIED):
+        far = np.flatnonzero(np.linalg.norm(places[first + 1 :] - places[first], axis=-1) >= far_m)
+        pairs += [(first, first + 1 + int(far[0]))] if len(far) else []
+    return pairs
+
+
 class _View:
     """A camera of the recording, with the pictures that are compared."""
 
     def __init__(self, recording: Recording, camera: RecordedCamera, usable: Bool[np.ndarray, "h w"]) -> None:
-        self.camera, self._path = camera, recording.trajectory
+        path = recording.trajectory
+        assert path is not None
+        self.camera, self._path = camera, path
         side = max(camera.camera.width, camera.camera.height)
         self._factors = [max(1, round(side / px)) for px in (_CONTRAST_PX, _EDGES_PX)]
         self.small, self._finer = (camera.camera.downscaled(factor) for factor in self._factors)
         self.usable, self._finer_usable = (
             cv2.erode(downscale_mask(usable, factor).astype(np.float32), np.ones((9, 9))) for factor in self._factors
         )
-        self._vehicles: dict[tuple[float, ...], Float64[np.ndarray, "2 4 4"]] = {}
+        # most readings leave the path as it is
+        self._given = lru_cache(None)(lambda *times_s: path.at(np.array(times_s)))
         self.pairs = self._pairs(recording)
 
     def _pairs(self, recording: Recording) -> list[_Pair]:
@@ -274,34 +285,24 @@ class _View:
         pictures = [one for one in recording.pictures if one.camera == self.camera.name]
         pictures.sort(key=lambda one: one.time_s)
         places = np.array([recording.pose(picture)[:3, 3] for picture in pictures]).reshape(-1, 3)
-        pairs = []
-        for first in spread_over(len(pictures), _TRIED):
-            far = np.flatnonzero(np.linalg.norm(places[first + 1 :] - places[first], axis=-1) >= _MOVED_M)
-            pairs += [(pictures[first], pictures[first + 1 + int(far[0])])] if len(far) else []
+        pairs = _pairs_apart(places, _MOVED_M)
         found = []
         for index in spread_over(len(pairs), _PAIRS):
-            read = [read_if_whole(partial(read_image, picture.path)) for picture in pairs[index]]
+            first, second = (pictures[one] for one in pairs[index])
+            read = [read_if_whole(partial(read_image, picture.path)) for picture in (first, second)]
             if read[0] is None or read[1] is None:
                 continue
             contrasts = [_contrast(downscale_image(picture, self._factors[0])) for picture in (read[0], read[1])]
             edges = _edges(downscale_image(read[0], self._factors[1]))
             inner = self._finer_usable > 0
             edges /= max(float(edges[inner].mean()) if inner.any() else 1.0, 1e-6)
-            found.append(_Pair(pairs[index], (contrasts[0], contrasts[1]), edges))
+            found.append(_Pair((first, second), (contrasts[0], contrasts[1]), edges))
         return found
 
     def poses(self, pair: _Pair, reading: Reading) -> tuple[Transform, Transform]:
         """Camera to world, of both pictures."""
-        assert self._path is not None
-        path = self._path if reading.path is None else reading.path(self._path)
-        times_s = tuple(picture.time_s + reading.pictures_later_s for picture in pair.pictures)
-        if path is not self._path:
-            vehicles = path.at(np.array(times_s))
-        else:
-            # most readings leave the path as it is
-            if times_s not in self._vehicles:
-                self._vehicles[times_s] = path.at(np.array(times_s))
-            vehicles = self._vehicles[times_s]
+        times_s = [picture.time_s + reading.pictures_later_s for picture in pair.pictures]
+        vehicles = self._given(*times_s) if reading.path is None else reading.path(self._path).at(np.array(times_s))
         first, second = (vehicle @ reading.camera(self.camera.to_vehicle) for vehicle in vehicles)
         own = [picture.camera_to_world for picture in pair.pictures]
         if own[0] is not None and own[1] is not None:
@@ -370,6 +371,7 @@ class _Source:
         assert recording.trajectory is not None
         self.name, self._path = name, recording.trajectory
         self.sweeps = sorted((one for one in recording.sweeps if one.scanner == name), key=lambda one: one.time_s)
+        self._times_s = np.array([one.time_s for one in self.sweeps])
         self._scans: dict[object, _Scan | None] = {}
         self._maps: dict[object, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -377,40 +379,36 @@ class _Source:
         """Read a sweep, once."""
         if recorded.path not in self._scans:
             read = read_if_whole(recorded.read)
-            self._scans[recorded.path] = None if read is None else _scan(read, recorded)
+            self._scans[recorded.path] = None if read is None else _scan(read, recorded, self._path)
         return self._scans[recorded.path]
 
     def fit(self, view: _View, pairs: Iterable[_Pair], reading: Reading) -> _Fit:
         """How well a reading of this fits a camera."""
         values, edges, asked = [], [], 0
         for pair in pairs:
-            scan = None
-            if pair.pictures[0].depth is not None:
-                world = self._of_map(view, pair, reading)
-            else:
-                scan = self.nearest(pair.pictures[0].time_s + reading.pictures_later_s - reading.scans_later_s)
-                if scan is None:
-                    continue
-                world = scan.seen.world(reading, self._path)
+            world = self.points(view, pair, reading)
+            if world is None:
+                continue
             asked += len(world)
             _, pixels = view.seen(pair, world, reading)
             of_pictures = [_sampled(c, p) for c, p in zip(pair.contrasts, pixels, strict=True)]
             values.append(np.stack([*of_pictures, _sampled(pair.contrasts[1], pixels[0])]))
-            if scan is not None:
-                edges.append(view.edge(pair, scan.edges.world(reading, self._path), reading))
+            if (scan := self.nearest(pair, reading)) is not None:
+                edges.append(view.edge(pair, scan.edges.world(reading), reading))
         return _fit(values, edges, asked)
 
-    def nearest(self, time_s: float) -> _Scan | None:
-        """The sweep of a time, if there is one."""
-        recorded = min(self.sweeps, key=lambda one: abs(one.time_s - time_s))
-        return self.scan(recorded) if abs(recorded.time_s - time_s) <= _APART_S else None
+    def nearest(self, pair: _Pair, reading: Reading) -> _Scan | None:
+        """The sweep of a pair's first picture, if there is one."""
+        time_s = pair.pictures[0].time_s + reading.pictures_later_s - reading.scans_later_s
+        apart_s = np.abs(self._times_s - time_s)
+        return self.scan(self.sweeps[apart_s.argmin()]) if apart_s.min(initial=math.inf) <= _APART_S else None
 
-    def points(self, view: _View, pair: _Pair) -> Float64[np.ndarray, "n 3"] | None:
-        """What is seen of the world by a pair, as given."""
+    def points(self, view: _View, pair: _Pair, reading: Reading) -> Float64[np.ndarray, "n 3"] | None:
+        """What is seen of the world by a pair."""
         if pair.pictures[0].depth is not None:
-            return self._of_map(view, pair, Reading())
-        scan = self.nearest(pair.pictures[0].time_s)
-        return None if scan is None else scan.seen.world(Reading(), self._path)
+            return self._of_map(view, pair, reading)
+        scan = self.nearest(pair, reading)
+        return None if scan is None else scan.seen.world(reading)
 
     def _of_map(self, view: _View, pair: _Pair, reading: Reading) -> Float64[np.ndarray, "n 3"]:
         picture = pair.pictures[0]
@@ -429,13 +427,7 @@ class _Source:
     @cached_property
     def _two_sweeps(self) -> list[tuple[_Points, _Points]]:
         """Pairs of sweeps between which the vehicle has moved."""
-        if len(self.sweeps) < 2:
-            return []
-        places = self._path.at(np.array([one.time_s for one in self.sweeps]))[:, :3, 3]
-        pairs = []
-        for first in spread_over(len(self.sweeps) - 1, _TRIED):
-            far = np.flatnonzero(np.linalg.norm(places[first + 1 :] - places[first], axis=-1) >= _SWEEPS_MOVED_M)
-            pairs += [(first, first + 1 + int(far[0]))] if len(far) else []
+        pairs = _pairs_apart(self._path.at(self._times_s)[:, :3, 3], _SWEEPS_MOVED_M)
         found = []
         for index in spread_over(len(pairs), 3):
             scans = [self.scan(self.sweeps[one]) for one in pairs[index]]
@@ -447,7 +439,7 @@ class _Source:
         """Mean distance between the upright surfaces of sweeps, at most half a metre each."""
         found = []
         for few, many in self._two_sweeps:
-            points, others = few.world(reading, self._path), many.world(reading, self._path)
+            points, others = few.world(reading), many.world(reading)
             distance_m, nearest = KDTree(others).query(points, 10, distance_upper_bound=1.0)
             met = np.isfinite(distance_m).all(-1)
             around = others[np.asarray(nearest)[met]]
@@ -462,13 +454,13 @@ class _Source:
         return float(apart.mean()) if len(apart) >= 100 else None
 
 
-def _scan(read: Sweep, recorded: RecordedSweep) -> _Scan:
+def _scan(read: Sweep, recorded: RecordedSweep, path: Trajectory) -> _Scan:
     points = read.points_m.double().numpy()
     offset_s = offsets_s(read, recorded.timing, deskew=True).double().numpy()
     order = np.random.default_rng(0).permutation(len(points))
 
     def some(index: np.ndarray) -> _Points:
-        return _Points(points[index], offset_s[index], recorded)
+        return _Points(points[index], offset_s[index], recorded, path)
 
     few, many = (some(order[:count]) for count in _SWEEP_POINTS)
     return _Scan(some(order[:_POINTS]), some(_steps(points)), few, many)
@@ -485,10 +477,8 @@ class _Candidate:
     given: Transform
     """From the scanner to the vehicle; of maps the camera's."""
     gain: float = -math.inf
-    by_contrast: float = 0.0
-    by_edges: float = 0.0
-    by_sweeps: float = 0.0
-    """Parts of it, before edges are cubed."""
+    gains: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Its parts by contrast, edges and sweeps, before edges are cubed."""
     lack: float = 1.0
     before: float = 1.0
     """The mean lack as given."""
@@ -500,9 +490,8 @@ class _Candidate:
         """Whether it is named."""
         if not self.reading.both:
             return self.gain >= self.reading.clear and self.lack < _FITTING
-        gains = self.by_contrast, self.by_edges, self.by_sweeps
         told = any(
-            all(gain >= least for gain, least in zip(gains, asked, strict=False))
+            all(gain >= least for gain, least in zip(self.gains, asked, strict=False))
             for asked in (_LEAST_GAINS, _LEAST_GAINS_WITH_SWEEPS)
         )
         return self.gain >= self.reading.clear and self.lack < min(_FITTING, _MOVES_SMALL * self.still) and told
@@ -521,27 +510,16 @@ def _of_point_times(source: _Source) -> list[Reading]:
     def other_half(given: np.ndarray) -> np.ndarray:
         return np.where(given < middle_s, given + turn_s / 2, given - turn_s / 2)
 
-    by_azimuth = timing is not None
+    backwards = "the point times of {name} count backwards: change their sign, or timestamp"
+    off = "the point times of {name} are off by half a turn"
+    if timing is not None:
+        backwards = "{name} turns the other way: change its direction"
+        off = "the scans of {name} begin on the other side: add 180 to start_azimuth_deg"
+    corrected = "the points of {name} are corrected for the vehicle's motion already: set corrected_to"
     return [
-        Reading(
-            "{name} turns the other way: change its direction"
-            if by_azimuth
-            else "the point times of {name} count backwards: change their sign, or timestamp",
-            point_times=lambda given: 2 * middle_s - given,
-            clear=CLEAR_SMALL,
-        ),
-        Reading(
-            "the scans of {name} begin on the other side: add 180 to start_azimuth_deg"
-            if by_azimuth
-            else "the point times of {name} are off by half a turn",
-            point_times=other_half,
-            clear=CLEAR_SMALL,
-        ),
-        Reading(
-            "the points of {name} are corrected for the vehicle's motion already: set corrected_to",
-            point_times=lambda given: np.full_like(given, middle_s),
-            clear=CLEAR_SMALL,
-        ),
+        Reading(backwards, point_times=lambda given: 2 * middle_s - given, clear=CLEAR_SMALL),
+        Reading(off, point_times=other_half, clear=CLEAR_SMALL),
+        Reading(corrected, point_times=lambda given: np.full_like(given, middle_s), clear=CLEAR_SMALL),
     ]
 
 
@@ -561,16 +539,12 @@ def check_lidar(recording: Recording, usable: Mapping[str, Bool[np.ndarray, "h w
     views = [_View(recording, camera, usable[camera.name]) for camera in recording.cameras]
     figures: list[LidarFigures] = []
     warnings: list[str] = []
-    for name in dict.fromkeys(sweep.scanner for sweep in recording.sweeps):
-        source = _Source(recording, name)
-        found, said = _evaluated(source, views)
+    sources = [(name, views) for name in dict.fromkeys(sweep.scanner for sweep in recording.sweeps)]
+    with_maps = [view for view in views if view.pairs and view.pairs[0].pictures[0].depth is not None]
+    for name, seen_by in (*sources, *((view.camera.name, [view]) for view in with_maps)):
+        found, said = _evaluated(_Source(recording, name), seen_by)
         figures += found
         warnings += said
-    for view in views:
-        if view.pairs and view.pairs[0].pictures[0].depth is not None:
-            found, said = _evaluated(_Source(recording, view.camera.name), [view])
-            figures += found
-            warnings += said
     return LidarCheck(tuple(figures), tuple(dict.fromkeys(warnings)))
 
 
@@ -695,21 +669,15 @@ def _tried(
     )
     if lack > _MOVES * still:
         return unfit
-    gain = math.log(before / lack)
+    by_contrast, by_sweeps = math.log(before / lack), 0.0
     steps = [math.log(a.edge / b.edge) for b, a in told if a.edge > 0 and b.edge > 0]
-    step = _within(float(np.mean(steps)), _MOST_BY_EDGES) if steps else 0.0
-    parts = {"by_contrast": gain, "by_edges": step}
-    gain += 3 * step
+    step = float(np.clip(np.mean(steps), -_MOST_BY_EDGES, _MOST_BY_EDGES)) if steps else 0.0
+    gain = by_contrast + 3 * step
     of_sweeps = candidate.sensor == source.name and not reading.scales
-    if apart_m is not None and of_sweeps and gain > -0.2:
-        other_m = source.apart_m(reading)
-        parts["by_sweeps"] = 0.0 if other_m is None else _within(math.log(apart_m / other_m), _MOST_BY_SWEEPS)
-        gain += parts["by_sweeps"]
-    return replace(candidate, gain=gain, lack=lack, before=before, still=still, **parts)
-
-
-def _within(value: float, most: float) -> float:
-    return min(max(value, -most), most)
+    if apart_m is not None and of_sweeps and gain > -0.2 and (other_m := source.apart_m(reading)) is not None:
+        by_sweeps = float(np.clip(math.log(apart_m / other_m), -_MOST_BY_SWEEPS, _MOST_BY_SWEEPS))
+    gains = by_contrast, step, by_sweeps
+    return replace(candidate, gain=gain + by_sweeps, gains=gains, lack=lack, before=before, still=still)
 
 
 def _refined(source: _Source, best: _Candidate, given: dict[_View, _Fit], apart_m: float | None) -> _Candidate:
@@ -773,7 +741,7 @@ def _ratios(source: _Source, view: _View) -> tuple[np.ndarray, np.ndarray]:
     found, sides = [np.zeros(0)], [np.zeros(0, int)]
     patch = np.stack(np.meshgrid(np.arange(-2.0, 3), np.arange(-2.0, 3)), -1).reshape(-1, 2)
     for pair in view.pairs[1::2]:
-        world = source.points(view, pair)
+        world = source.points(view, pair, Reading())
         if world is None:
             continue
         in_first, (first, _) = view.seen(pair, world, Reading())

@@ -9,12 +9,11 @@ until all maps are written, so that a stopped run resumes where it stopped.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import io
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -56,11 +55,14 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     if len(pictures) < FEWEST_PICTURES:
         say(console, f"No distances from motion: {len(pictures)} training pictures are too few.", "yellow")
         return
-    motion = Motion(
-        np.stack([picture.position_m for picture in pictures]),
-        [picture.camera for picture in pictures],
-        lambda index: scene_view(scene, pictures[index]),
-    )
+
+    def view(index: int) -> View:
+        """A picture as the sweep wants it."""
+        one = pictures[index]
+        return view_of(scene.rgb(one), scene.usable(one), one.lens, one.pose, scene.theta_max_rad)
+
+    positions_m = np.stack([picture.position_m for picture in pictures])
+    motion = Motion(positions_m, [picture.camera for picture in pictures], view)
     with console.status("Searching for neighbours of pictures …"):
         still = sum(len(motion.neighbours(index)) < LEAST_AGREEING for index in range(len(pictures)))
     if still == len(pictures):
@@ -72,29 +74,26 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     numbers = {picture.name: index for index, picture in enumerate(pictures)}
     shares: list[float] = []
 
-    def around(index: int) -> MotionDistance:
+    def around(index: int) -> Float32[np.ndarray, "_ _"]:
         neighbours = motion.neighbours(index)
         theirs = [store.confirmed(other).distance_m for other in neighbours]
-        seen_m = seen_around(motion.view(index), [motion.view(other) for other in neighbours], theirs)
-        return dataclasses.replace(store.confirmed(index), distance_m=seen_m)
+        return seen_around(motion.view(index), [motion.view(other) for other in neighbours], theirs)
 
     def maps(layer: str) -> Iterator[tuple[str, Float32[np.ndarray, "_ _"]]]:
         for picture in scene.pictures:
-            size = (picture.lens.height, picture.lens.width)
-            if picture.held_out:
-                yield picture.name, np.zeros(size, np.float32)
-                continue
-            index, factor = numbers[picture.name], working_factor(picture.lens)
-            if layer == "motion_around":
-                yield picture.name, enlarged(around(index), factor, size)
-                continue
-            found = store.confirmed(index)
-            if layer == "motion_sigma":
-                yield picture.name, enlarged_sigma(found, factor, size)
-                continue
-            used = motion.view(index).used
-            shares.append(float((found.distance_m > 0).sum() / max(1, used.sum())))
-            yield picture.name, enlarged(found, factor, size)
+            size, factor = (picture.lens.height, picture.lens.width), working_factor(picture.lens)
+            index = numbers.get(picture.name)
+            if index is None:
+                map_ = np.zeros(size, np.float32)
+            elif layer == "motion_around":
+                map_ = enlarged(around(index), factor, size)
+            elif layer == "motion_sigma":
+                map_ = enlarged_sigma(store.confirmed(index), factor, size)
+            else:
+                distance_m, used = store.confirmed(index).distance_m, motion.view(index).used
+                shares.append(float((distance_m > 0).sum() / max(1, used.sum())))
+                map_ = enlarged(distance_m, factor, size)
+            yield picture.name, map_
 
     source = {"kind": OWN_MOTION}
     with progress_bars(console) as progress:
@@ -108,17 +107,12 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
     say(console, f"{said}.", "yellow" if still else None)
 
 
-def scene_view(scene: SceneFolder, picture: ScenePicture) -> View:
-    """A scene's picture as the sweep wants it."""
-    return view_of(scene.rgb(picture), scene.usable(picture), picture.lens, picture.pose, scene.theta_max_rad)
-
-
-def enlarged(found: MotionDistance, factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
+def enlarged(distance_m: Float32[np.ndarray, "_ _"], factor: int, size: tuple[int, int]) -> Float32[np.ndarray, "_ _"]:
     """Bring distances to a picture's size (height, width): interpolated on surfaces, else the nearest; 0 = none."""
     if factor == 1:
-        return found.distance_m
-    kept = found.distance_m > 0
-    inverse = np.where(kept, 1 / np.where(kept, found.distance_m, 1), np.nan).astype(np.float32)
+        return distance_m
+    kept = distance_m > 0
+    inverse = np.where(kept, 1 / np.where(kept, distance_m, 1), np.nan).astype(np.float32)
     whole = (inverse.shape[1] * factor, inverse.shape[0] * factor)
     nearest = np.asarray(cv2.resize(inverse, whole, interpolation=cv2.INTER_NEAREST))
     between = np.asarray(cv2.resize(inverse, whole, interpolation=cv2.INTER_LINEAR))
@@ -141,52 +135,33 @@ class SphereSweepCache:
         """Make a folder in `root` for these pictures, in `motion`'s order, and remove those of other ones."""
         self.folder = root / _made_of(scene, pictures)
         self._motion = motion
-        self._swept = functools.lru_cache(_SWEEPS_IN_MEMORY)(partial(_swept, self.folder, motion))
+        self._swept = functools.lru_cache(_SWEEPS_IN_MEMORY)(self._sweep)
         for other in root.glob("*"):
             if other != self.folder:
                 shutil.rmtree(other, ignore_errors=True)
 
-    def make(self, index: int) -> bool:
-        """Sweep a picture, unless that is done; whether it had to be."""
-        path = _file(self.folder, index)
-        if _read(path, Swept) is not None:
-            return False
-        _write(path, self._motion.sweep(index))
-        return True
+    def make(self, index: int) -> None:
+        """Sweep a picture, unless that is done."""
+        self._sweep(index)
+
+    def _sweep(self, index: int) -> Swept:
+        return _kept(self.folder / f"{index:06d}.npz", Swept, partial(self._motion.sweep, index))
 
     def confirmed(self, index: int) -> MotionDistance:
         """What neighbours confirm of a picture's sweep; kept."""
-        path = _file(self.folder, index).with_suffix(".confirmed.npz")
-        found = _read(path, MotionDistance)
-        if found is None:
-            found = self._motion.confirm(index, self._swept)
-            _write(path, found)
-        return found
+        confirm = partial(self._motion.confirm, index, self._swept)
+        return _kept(self.folder / f"{index:06d}.confirmed.npz", MotionDistance, confirm)
 
 
-def _file(folder: Path, index: int) -> Path:
-    return folder / f"{index:06d}.npz"
-
-
-def _swept(folder: Path, motion: Motion, index: int) -> Swept:
-    """The sweep of a picture; one that is lost is made again."""
-    swept = _read(_file(folder, index), Swept)
-    return motion.sweep(index) if swept is None else swept
-
-
-def _read(path: Path, kind: type[Maps]) -> Maps | None:
-    """Maps of a picture, if they are kept."""
+def _kept(path: Path, kind: type[Maps], make: Callable[[], Maps]) -> Maps:
+    """Maps of a picture from its file; those that are lost are made, and kept."""
     content = content_of(path, VERSION)
-    if content is None:
-        return None
-    return kind(**load_archive(content))
-
-
-def _write(path: Path, maps: Swept | MotionDistance) -> None:
-    """Keep maps of a picture."""
-    archive = io.BytesIO()
-    np.savez(archive, **{field.name: getattr(maps, field.name) for field in dataclasses.fields(maps)})
+    if content is not None:
+        return kind(**load_archive(content))
+    maps, archive = make(), io.BytesIO()
+    np.savez(archive, **vars(maps))
     write_checked(path, VERSION, lambda file: file.write(archive.getbuffer()))
+    return maps
 
 
 def _made_of(scene: SceneFolder, pictures: list[ScenePicture]) -> str:

@@ -8,13 +8,13 @@ held-out picture gets a mask from its own sweep: it decides which pixels are eva
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float64
 from numpy.typing import NDArray
 from rich.console import Console
 from scipy.spatial import KDTree
@@ -168,25 +168,13 @@ def _not_alone(things: Sequence[Thing], expected: Sequence[Thing]) -> list[Thing
 # ---- in a picture ----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Points:
-    """Points that a scanner says something of at a picture's time."""
+Points = Float64[np.ndarray, "n 4"]
+"""What a scanner says something of at a picture's time: x, y, z, and how far apart such points are, metres."""
 
-    points_m: Float[np.ndarray, "n 3"]
-    spacing_m: Float[np.ndarray, "n"]
 
-    @staticmethod
-    def joined(parts: Sequence[_Points]) -> _Points:
-        return _Points(
-            np.concatenate([part.points_m for part in parts]), np.concatenate([part.spacing_m for part in parts])
-        )
-
-    def chosen(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> _Points:
-        return _Points(self.points_m[which], self.spacing_m[which])
-
-    def raised(self, by_m: float) -> _Points:
-        """The same higher up, in steps that are no wider than the points are apart."""
-        return _Points(self.points_m + np.array((0.0, 0.0, by_m)), np.maximum(self.spacing_m, np.float32(_STEP_M)))
+def _raised(points: Points, by_m: float) -> Points:
+    """The same higher up, in steps that are no wider than the points are apart."""
+    return np.column_stack((points[:, :2], points[:, 2] + by_m, np.maximum(points[:, 3], _STEP_M)))
 
 
 def _write_mask(
@@ -233,18 +221,17 @@ def _moving_pixels(
     world_to_camera = np.linalg.inv(camera_to_world)
     moving, cut_off, taken = _at_time(sweep, things, late_s, scanner.ground)
     for highest in cut_off:
-        lines = [highest.chosen(up) for up in _heights(scanner.ground.above_m(highest.points_m))]
-        steps = [line.raised((number + 1) * _STEP_M) for number, line in enumerate(lines)]
+        lines = [highest[up] for up in _heights(scanner.ground.above_m(highest[:, :3]))]
+        steps = [_raised(line, (number + 1) * _STEP_M) for number, line in enumerate(lines)]
         roof = clearest_edge(image, [_pixels(_in_camera(world_to_camera, step), step, camera)[0] for step in steps])
-        moving = _Points.joined([moving, *steps[: 0 if roof is None else roof + 1]])
-    rest = np.ones(len(sweep.points_m), bool)
-    rest[taken] = False
-    every = _Points.joined([moving, _Points(sweep.points_m.numpy()[rest], sweep.spacing_m.numpy()[rest])])
+        moving = np.concatenate([moving, *steps[: 0 if roof is None else roof + 1]])
+    every = np.concatenate([moving, np.delete(_points_of(sweep), taken, axis=0)])
     in_camera = _in_camera(world_to_camera, every)
-    chosen = project_points(in_camera.float(), camera, spacing_m=torch.from_numpy(every.spacing_m)).point_index.numpy()
-    shown = chosen[(chosen >= 0) & (chosen < len(moving.points_m))]
-    points_px, reach_px = _pixels(in_camera[shown], every.chosen(shown), camera)
-    holds_still = ~usable | (chosen >= len(moving.points_m))
+    spacing_m = torch.from_numpy(every[:, 3]).float()
+    chosen = project_points(in_camera.float(), camera, spacing_m=spacing_m).point_index.numpy()
+    shown = chosen[(chosen >= 0) & (chosen < len(moving))]
+    points_px, reach_px = _pixels(in_camera[shown], every[shown], camera)
+    holds_still = ~usable | (chosen >= len(moving))
     return grow_moving(image, points_px, reach_px, holds_still) & usable
 
 
@@ -255,31 +242,34 @@ def _heights(height_m: NDArray[np.float64]) -> Iterator[NDArray[np.bool_]]:
         yield height_m + step_m < _TALLEST_M
 
 
+def _points_of(sweep: WorldSweep) -> Points:
+    return np.column_stack((sweep.points_m.numpy(), sweep.spacing_m.numpy()))
+
+
 def _at_time(
     sweep: WorldSweep, things: Sequence[Thing], late_s: float, ground: Ground
-) -> tuple[_Points, list[_Points], NDArray[np.int64]]:
+) -> tuple[Points, list[Points], NDArray[np.int64]]:
     """Where things are some time after a sweep's time.
 
     Returns:
         Their points; of each long thing those at the upper edge of the scanner's field; rows of their LiDAR points.
     """
-    moving, cut_off, rows = [_Points(np.zeros((0, 3)), np.zeros(0, np.float32))], [], [np.zeros(0, np.int64)]
+    moving, cut_off, rows, whole = [np.zeros((0, 4))], [], [np.zeros(0, np.int64)], _points_of(sweep)
     for thing in things:
         of_thing = np.concatenate((thing.rows, _feet(sweep, thing, ground)))
-        points = sweep.points_m.numpy()[of_thing]
+        points = whole[of_thing]
         points[:, :2] += (late_s - sweep.offset_s.numpy()[of_thing])[:, None] * thing.velocity_m_s
-        points_of_thing = _Points(points, sweep.spacing_m.numpy()[of_thing])
         elevation = elevation_rad(sweep.points_m[of_thing], sweep).numpy()
         rows.append(of_thing)
-        moving.append(points_of_thing)
+        moving.append(points)
         # below the scanner's field the thing goes on
-        lowest = points_of_thing.chosen(elevation < sweep.elevation_rad[0] + _EDGE_RAD)
-        height = ground.above_m(lowest.points_m)
+        lowest = points[elevation < sweep.elevation_rad[0] + _EDGE_RAD]
+        height = ground.above_m(lowest[:, :3])
         for step_m in np.arange(_STEP_M, float(height.max(initial=0)) - _BODY_ENDS_M, _STEP_M):
-            moving.append(lowest.chosen(height - step_m > _BODY_ENDS_M).raised(-step_m))
+            moving.append(_raised(lowest[height - step_m > _BODY_ENDS_M], -step_m))
         if np.ptp(thing.points_m[:, :2], axis=0).max() > _LONG_M:
-            cut_off.append(points_of_thing.chosen(elevation > sweep.elevation_rad[1] - _EDGE_RAD))
-    return _Points.joined(moving), cut_off, np.concatenate(rows)
+            cut_off.append(points[elevation > sweep.elevation_rad[1] - _EDGE_RAD])
+    return np.concatenate(moving), cut_off, np.concatenate(rows)
 
 
 def _feet(sweep: WorldSweep, thing: Thing, ground: Ground) -> NDArray[np.int64]:
@@ -293,19 +283,17 @@ def _feet(sweep: WorldSweep, thing: Thing, ground: Ground) -> NDArray[np.int64]:
     return near[np.isfinite(away_m)]
 
 
-def _in_camera(world_to_camera: NDArray[np.float64], points_of_thing: _Points) -> torch.Tensor:
-    return transform_points(torch.from_numpy(world_to_camera), torch.from_numpy(points_of_thing.points_m))
+def _in_camera(world_to_camera: NDArray[np.float64], points: Points) -> torch.Tensor:
+    return transform_points(torch.from_numpy(world_to_camera), torch.from_numpy(points[:, :3]))
 
 
 def _pixels(
-    points_in_camera: torch.Tensor, points_of_thing: _Points, camera: Camera
+    points_in_camera: torch.Tensor, points: Points, camera: Camera
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where points are seen, and how many pixels their spacing is; those out of view are left out."""
     across = torch.linalg.cross(points_in_camera, points_in_camera.roll(1, dims=-1))
     across = across / across.norm(dim=-1, keepdim=True).clamp(min=1e-9)
     pixels, valid = camera.project(points_in_camera)
-    beside, valid_beside = camera.project(
-        points_in_camera + across * torch.from_numpy(points_of_thing.spacing_m)[:, None]
-    )
+    beside, valid_beside = camera.project(points_in_camera + across * torch.from_numpy(points[:, 3:]))
     seen = valid & valid_beside & camera.inside(pixels)
     return pixels[seen].numpy(), (beside - pixels)[seen].norm(dim=-1).numpy()

@@ -88,6 +88,22 @@ class ProcessOptions:
             )
         return range(self.first, last + 1, self.stride)
 
+    def map_of(self, camera: str, frame: int, option: Literal["frame_masks", "mono"]) -> Path | None:
+        """The file that an option gives for a picture, if it is set.
+
+        Raises:
+            FileNotFoundError: its folder has none for this picture.
+        """
+        folder: Path | None = getattr(self, option)
+        path = None if folder is None else folder / camera / f"{frame:010d}.png"
+        if path is not None and not path.is_file():
+            name = f"--{option.replace('_', '-')}"
+            raise FileNotFoundError(
+                f"{path}: no such file; {name} needs one for every picture taken, named after the frame's number. Make "
+                f"the missing ones, choose other frames, or leave out {name}."
+            )
+        return path
+
     def check(self) -> None:
         """Check the ranges.
 

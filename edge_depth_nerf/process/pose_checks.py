@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +10,9 @@ from rich.console import Console
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image
-from edge_depth_nerf.poses.matches import PosedPicture, along_drive
+from edge_depth_nerf.poses.matches import along_drive
 from edge_depth_nerf.poses.path_agreement import compare_paths, read_agreement, write_agreement
-from edge_depth_nerf.process.feature_masks import FeatureMasks
+from edge_depth_nerf.process.feature_masks import FeatureMasks, posed_pictures
 from edge_depth_nerf.process.lidar_poses import check_sweeps, path_of
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.recording import Recording
@@ -30,20 +29,9 @@ def features_say(recording: Recording, options: ProcessOptions, console: Console
     Raises:
         InputError: under `strict`, a picture or a mask cannot be read.
     """
-    lenses = {camera.name: camera.camera for camera in recording.cameras}
-    masks = FeatureMasks(recording, options, dict.fromkeys(lenses, math.radians(options.theta_max_deg)))
-    posed = [
-        PosedPicture(
-            camera=picture.camera,
-            frame=picture.frame,
-            lens=lenses[picture.camera],
-            camera_to_world=picture.camera_to_world,
-            read_rgb=partial(read_image, picture.path),
-            read_usable=partial(masks.of, picture),
-        )
-        for picture in recording.pictures
-        if picture.camera_to_world is not None
-    ]
+    limit_rad = math.radians(options.theta_max_deg)
+    masks = FeatureMasks(recording, options, {camera.name: limit_rad for camera in recording.cameras})
+    posed = posed_pictures(recording, masks, lambda picture, _: read_image(picture.path))
     with console.status("Comparing the poses with features of the pictures"):
         try:
             found = [pair for pair in along_drive(posed, apart=(1,)) if np.isfinite(pair.median_px)]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from datetime import datetime, timezone
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -152,7 +153,7 @@ def read_times(path: Path, unit: str = "s") -> list[tuple[str | None, float]]:
     found: list[tuple[str | None, float]] = []
     first = ""
     for line, words in _lines(path):
-        form, name, time = _time_of_line(words, f"{path}, line {line}")
+        form, name, time = _time_of_line(words, first, f"{path}, line {line}")
         if form == "date" and unit != "s":
             raise InputError(
                 f"{path}, line {line}: the time is a date, but time_unit is {unit!r}. Dates need no unit: leave out "
@@ -168,10 +169,32 @@ def read_times(path: Path, unit: str = "s") -> list[tuple[str | None, float]]:
     return found
 
 
-def _time_of_line(words: list[str], where: str) -> tuple[str, str | None, float]:
-    """The form of a line, and its name and time."""
-    if (dated := seconds_of_date(" ".join(words))) is not None:
+def read_frame_times(path: Path, otherwise: str = "") -> list[float]:
+    """Read the times of a data set's frames, a line each; `otherwise`: what else to do than to copy the file again.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        InputError: a line is no time, or not after the one before.
+    """
+    times_s = [time for _, time in read_times(path)]
+    for line, (before, time) in enumerate(pairwise(times_s), 2):
+        if not time > before:
+            raise InputError(
+                f"{path}, line {line}: not after the line before. Copy the file again from the data set{otherwise}."
+            )
+    return times_s
+
+
+def _time_of_line(words: list[str], first: str, where: str) -> tuple[str, str | None, float]:
+    """The form of a line, and its name and time; `first`: that of the first line, if this is another."""
+    text = " ".join(words)
+    if (dated := seconds_of_date(text)) is not None:
         return "date", None, dated
+    if first == "date":
+        raise InputError(
+            f"{where}: {shown(text)} is not a time like 2013-05-28 08:46:02.123456789, as the lines before it. Copy "
+            "the file again."
+        )
     if len(words) > 2:
         raise InputError(
             f"{where}: {len(words)} words, expected a time, a file's name and a time, a time and a file's name, or a "

@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Float64
@@ -72,12 +71,6 @@ def _turned(axis: str, degrees: float) -> Transform:
 
 def _after(change: Transform) -> Change:
     return lambda given: given @ change
-
-
-def _rescaled(given: Transform, metres: float) -> Transform:
-    found = given.copy()
-    found[:3, 3] *= metres
-    return found
 
 
 def _axes() -> list[tuple[Transform, str]]:
@@ -170,9 +163,7 @@ def small(sensor: str) -> list[Reading]:
 
 def mountings(sensor: str) -> list[Reading]:
     """Large faults of a transform to the vehicle."""
-    found = [
-        _mounting(sensor, "to_vehicle of {name} is inverted: give its inverse", lambda given: np.linalg.inv(given))
-    ]
+    found = [_mounting(sensor, "to_vehicle of {name} is inverted: give its inverse", np.linalg.inv)]
     for change, said in _axes():
         if sensor == "scanner" or np.linalg.det(change[:3, :3]) > 0:
             remedy = "change its to_vehicle, or its points" if sensor == "scanner" else "change its to_vehicle"
@@ -180,7 +171,7 @@ def mountings(sensor: str) -> list[Reading]:
     found += [replace(turn(sensor, "z" if sensor == "scanner" else "y")(angle), step=15.0) for angle in _YAWS_DEG]
     for unit, metres in UNITS.items():
         said = f"the translation in to_vehicle of {{name}} is in {unit}: give metres"
-        found.append(_mounting(sensor, said, partial(_rescaled, metres=metres)))
+        found.append(_mounting(sensor, said, lambda given, m=metres: rigid(given[:3, :3], given[:3, 3] * m)))
     return found
 
 
@@ -236,38 +227,26 @@ def of_sensors(mountings: Iterable[tuple[str, Transform]]) -> list[Reading]:
 def of_path() -> list[Reading]:
     """Other readings of the poses."""
 
-    def changed(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Trajectory], Trajectory]:
-        return lambda path: Trajectory(path.times_s, change(path.vehicle_to_world))
+    def changed(said: str, change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Reading:
+        """`change` takes rotations and positions."""
 
-    def placed(change: Transform) -> Callable[[np.ndarray], np.ndarray]:
-        def moved(poses: np.ndarray) -> np.ndarray:
-            found = poses.copy()
-            found[:, :3, 3] = poses[:, :3, 3] @ change[:3, :3].T
-            return found
+        def read(path: Trajectory) -> Trajectory:
+            poses = path.vehicle_to_world
+            return Trajectory(path.times_s, change(poses[:, :3, :3], poses[:, :3, 3]))
 
-        return moved
+        return Reading(said, path=read)
 
-    def other_order(poses: np.ndarray) -> np.ndarray:
-        found = poses.copy()
-        given = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-        found[:, :3, :3] = Rotation.from_quat(given[:, [1, 2, 3, 0]]).as_matrix()
-        return found
+    def other_order(turns: np.ndarray) -> np.ndarray:
+        return Rotation.from_quat(Rotation.from_matrix(turns).as_quat()[:, [1, 2, 3, 0]]).as_matrix()
 
-    def transposed(poses: np.ndarray) -> np.ndarray:
-        found = poses.copy()
-        found[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
-        return found
-
-    found = [
-        Reading("the poses' quaternions begin with w: write qx qy qz qw", path=changed(other_order)),
-        Reading("the poses are world to vehicle: give their inverses", path=changed(np.linalg.inv)),
-        Reading("the poses' rotations are world to vehicle: transpose them", path=changed(transposed)),
-    ]
-    found += [Reading(f"the poses' positions are {said}", path=changed(placed(change))) for change, said in _axes()]
-    return found + [
-        Reading(
-            f"the poses' positions are in {unit}: metres_per_unit = {metres:g}",
-            path=changed(placed(np.diag([metres] * 3 + [1.0]))),
-        )
-        for unit, metres in UNITS.items()
+    axes = [(said, change[:3, :3]) for change, said in _axes()]
+    units = [(f"in {unit}: metres_per_unit = {metres:g}", np.diag([metres] * 3)) for unit, metres in UNITS.items()]
+    return [
+        changed("the poses' quaternions begin with w: write qx qy qz qw", lambda t, p: rigid(other_order(t), p)),
+        changed("the poses are world to vehicle: give their inverses", lambda t, p: np.linalg.inv(rigid(t, p))),
+        changed("the poses' rotations are world to vehicle: transpose them", lambda t, p: rigid(t.swapaxes(1, 2), p)),
+        *(
+            changed(f"the poses' positions are {said}", lambda t, p, change=change: rigid(t, p @ change.T))
+            for said, change in (*axes, *units)
+        ),
     ]

@@ -32,7 +32,7 @@ from edge_depth_nerf.process.poses import read_kitti, read_nerfstudio, read_time
 from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import DepthFile, RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.process.rig_file import Clock, Rig, RigCamera, RigLidar, RigPoses, read_rig
-from edge_depth_nerf.scene.checks import Tolerance, check_picture_size, check_size
+from edge_depth_nerf.scene.checks import Tolerance, check_picture_size, check_size, require_folder
 from edge_depth_nerf.scene.writer import Skipped, summarise
 
 _LOOKED_AT = 5
@@ -91,9 +91,7 @@ def read_rig_recording(options: RigOptions) -> Recording:
         FileNotFoundError: a folder or file of the recording is missing.
         InputError: an option or a file of the recording cannot be used.
     """
-    options.check()
-    if not options.root.is_dir():
-        raise FileNotFoundError(f"{options.root}: no such folder; --root takes the recording's folder.")
+    require_folder(options.root, "--root takes the recording's folder")
     there = [options.root / name for name in _RIG_FILES if (options.root / name).is_file()]
     if options.rig is None and len(there) != 1:
         found = " and ".join(path.name for path in there) or "neither"
@@ -589,8 +587,7 @@ class _Companions:
         self._options = options
         self.turned: dict[str, Counter[int]] = defaultdict(Counter)
         """How many of each camera's pictures have which EXIF orientation, beside those that stand upright."""
-        keys = ("truth_distance", "truth_rgb") if options.mono else ("mono", "truth_distance", "truth_rgb")
-        for key in keys:
+        for key in ("depth", "truth_distance", "truth_rgb", *(() if options.mono else ("mono",))):
             lacking = [camera.name for camera in cameras if getattr(camera, key) is None]
             if 0 < len(lacking) < len(cameras):
                 raise InputError(
@@ -617,8 +614,8 @@ class _Companions:
         if orientation != 1:
             self.turned[camera.name][orientation] += 1
         # an option goes before what the rig file names
-        mask = self._by_number("frame_masks", camera, frame) or self._by_name(camera, "masks", picture.path)
-        mono = self._by_number("mono", camera, frame) or self._by_name(camera, "mono", picture.path)
+        mask = self._options.map_of(camera.name, frame, "frame_masks") or self._by_name(camera, "masks", picture.path)
+        mono = self._options.map_of(camera.name, frame, "mono") or self._by_name(camera, "mono", picture.path)
         depth = self._by_name(camera, "depth.files", picture.path)
         truth_distance = self._by_name(camera, "truth_distance", picture.path)
         truth_rgb = self._by_name(camera, "truth_rgb", picture.path)
@@ -659,15 +656,3 @@ class _Companions:
                 "taken, of the picture's name."
             )
         return files[picture.stem]
-
-    def _by_number(self, option: str, camera: RigCamera, frame: int) -> Path | None:
-        folder: Path | None = getattr(self._options, option)
-        if folder is None:
-            return None
-        path = folder / camera.name / f"{frame:010d}.png"
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"{path}: no such file; --{option.replace('_', '-')} needs one for every picture taken, named after "
-                "the frame's number."
-            )
-        return path

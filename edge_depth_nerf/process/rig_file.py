@@ -519,8 +519,4 @@ def _rig(whole: _Whole, path: Path) -> Rig:
             f"{path}: cameras.{both[0]}.depth and [lidars.{lidars[0].name}]: depth maps take the place of LiDAR; give "
             "one of them, not both."
         )
-    with_depth = [camera.name for camera in cameras if camera.depth]
-    if with_depth and len(with_depth) < len(cameras):
-        lacking = next(camera.name for camera in cameras if not camera.depth)
-        raise InputError(f"{path}: cameras.{lacking}.depth is missing; give depth maps for every camera or for none.")
     return Rig(path, cameras, lidars, poses)

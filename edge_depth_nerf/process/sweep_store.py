@@ -125,7 +125,8 @@ class Scanner:
         # of two pictures in work at once, each with its window and what its window's sweeps are checked against
         window = 4 * options.sweeps + 4
         self._loaded: _Shared[_Loaded] = _Shared(self._load, window)
-        self._moved: _Shared[Tensor] = _Shared(self._seen_through, window)
+        self.moved = _Shared(self._seen_through, window).get
+        """Gives which points of a sweep another sweep, that training may see, saw through."""
 
     def _load(self, index: int) -> _Loaded:
         recorded = self.sweeps[index]
@@ -187,10 +188,6 @@ class Scanner:
     def whole(self, index: int) -> WorldSweep:
         """A sweep with all its points."""
         return self._loaded.get(index).world
-
-    def moved(self, index: int) -> Bool[Tensor, "points"]:
-        """Which of them another sweep, that training may see, saw through."""
-        return self._moved.get(index)
 
 
 class SweepStore:
@@ -282,9 +279,9 @@ class _Gathered:
 
     def __init__(self, centre_m: np.ndarray) -> None:
         self._centre = torch.from_numpy(centre_m)
-        points_m, spacing_m = torch.empty(0, 3, dtype=torch.float64), torch.empty(0)
-        self._parts = [(points_m, spacing_m, torch.empty(0, dtype=torch.bool), torch.empty(0))]
-        self._hiding = [(points_m, spacing_m)]
+        nothing = torch.empty(0)
+        self._parts = [(torch.empty(0, 3, dtype=torch.float64), nothing, nothing.bool(), nothing)]
+        self._hiding: list[tuple[Tensor, Tensor, Tensor, Tensor]] = []
         self._voxel_m = VOXEL_M
 
     def add(self, points_m: Tensor, spacing_m: Tensor, moved: Tensor, age_s: float) -> None:
@@ -298,15 +295,11 @@ class _Gathered:
             self._voxel_m *= 1.2
 
     def hide(self, points_m: Tensor, spacing_m: Tensor) -> None:
-        self._hiding.append((points_m, spacing_m))
+        nothing = torch.zeros_like(spacing_m)
+        self._hiding.append((points_m, spacing_m, nothing.bool(), nothing))
 
     def together(self) -> Surroundings:
-        points, spacing, moved, age = (torch.cat(values) for values in zip(*self._parts, strict=True))
-        hiding, hiding_spacing = (torch.cat(values) for values in zip(*self._hiding, strict=True))
-        return Surroundings(
-            points_m=torch.cat((points, hiding)),
-            spacing_m=torch.cat((spacing, hiding_spacing)),
-            age_s=torch.cat((age, torch.zeros(len(hiding)))),
-            only_hides=torch.arange(len(points) + len(hiding)) >= len(points),
-            moved=torch.cat((moved, torch.zeros(len(hiding), dtype=torch.bool))),
-        )
+        parts = zip(*self._parts, *self._hiding, strict=True)
+        points, spacing, moved, age = (torch.cat(values) for values in parts)
+        only_hides = torch.arange(len(points)) >= sum(len(part[0]) for part in self._parts)
+        return Surroundings(points, spacing, age, only_hides, moved)

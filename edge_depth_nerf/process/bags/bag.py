@@ -62,7 +62,9 @@ class Bag:
         for file in self.files:
             _check_whole(file)
         self._stack = ExitStack()
-        self._readers = [self._opened(part) for part in _parts(path)]
+        # a folder of ROS 2's with its metadata, or each file
+        parts = [path] if (path / "metadata.yaml").is_file() else self.files
+        self._readers = [self._opened(part) for part in parts]
         self._is_ros1 = self.files[0].suffix == ".bag"
         connections = [connection for reader in self._readers for connection in reader.connections]
         self._store = self._typestore(connections)
@@ -189,11 +191,6 @@ def _files(path: Path) -> list[Path]:
             f"{path}: holds bags of different kinds ({found[0].name}, {found[-1].name}). Name one of them."
         )
     return found
-
-
-def _parts(path: Path) -> list[Path]:
-    """What is opened: a folder of ROS 2's with its metadata, or each file."""
-    return [path] if (path / "metadata.yaml").is_file() else _files(path)
 
 
 def _check_whole(path: Path) -> None:

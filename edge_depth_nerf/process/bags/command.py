@@ -29,18 +29,11 @@ from rich.table import Table
 
 from edge_depth_nerf.base.console import progress_bars, say
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import (
-    check_is_folder,
-    read_json,
-    remove_leftovers,
-    write_atomically,
-    write_json,
-    write_text,
-)
+from edge_depth_nerf.base.files import open_folder, remove_leftovers, write_atomically, write_text
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.process.bags import scans
-from edge_depth_nerf.process.bags.bag import Bag
+from edge_depth_nerf.process.bags.bag import Bag, Topic
 from edge_depth_nerf.process.bags.frames import (
     VEHICLE_FRAMES,
     Edge,
@@ -54,7 +47,7 @@ from edge_depth_nerf.process.bags.frames import (
 from edge_depth_nerf.process.bags.lenses import Lens
 from edge_depth_nerf.process.bags.options import UnpackOptions
 from edge_depth_nerf.process.bags.pictures import file_of
-from edge_depth_nerf.process.bags.rig_text import Mounted, looks_upward, rig_text
+from edge_depth_nerf.process.bags.rig_text import rig_text
 from edge_depth_nerf.process.bags.survey import (
     FIX,
     IMU,
@@ -72,6 +65,8 @@ from edge_depth_nerf.process.rig_file import TODO
 _MANIFEST, _RIG, _POSES = "unpack.json", "rig.toml", "poses.txt"
 _MOST_BROKEN = 0.1
 """A topic with a larger share of broken messages is a mistake."""
+_UPWARD = 0.9
+"""A camera whose axis points up so steeply has a frame with x forward, not an optical one."""
 _MAX_THREADS = 8
 
 
@@ -120,12 +115,9 @@ def _list(bag: Bag, found: Survey, console: Console) -> None:
     console.print(table)
     for scanner in found.scanners:
         if scanner.times is not None:
-            counted = {"stamp": "the scan's stamp", "1970": "1970", "first": "the first point"}
-            since = counted[scanner.times.counted_from]
-            say(
-                console,
-                f"{scanner.name}: points have times: {scanner.times.field}, in {scanner.times.unit} from {since}",
-            )
+            times, counted = scanner.times, {"stamp": "the scan's stamp", "1970": "1970", "first": "the first point"}
+            since = f"{times.field}, in {times.unit} from {counted[times.counted_from]}"
+            say(console, f"{scanner.name}: points have times: {since}")
         if scanner.note:
             say(console, f"{scanner.name}: {scanner.note}", "yellow")
     for camera in found.cameras:
@@ -142,28 +134,14 @@ def _open_folder(bag: Bag, options: UnpackOptions) -> None:
     """
     folder = options.output
     assert folder is not None
-    check_is_folder(folder)
     given = {key: value for key, value in asdict(options).items() if key not in ("bag", "output", "list")}
     manifest = {
         "kind": "unpacked bag",
         "files": [[path.name, path.stat().st_size] for path in bag.files],
         "options": {key: list(value) if isinstance(value, tuple) else value for key, value in given.items()},
     }
-    path = folder / _MANIFEST
-    if path.is_file():
-        if read_json(path) != manifest:
-            raise InputError(
-                f"{folder}: contains another bag, or one unpacked with other options ({path.name} lists them). Choose "
-                "another --output, or the same options to continue it."
-            )
-        remove_leftovers(folder)
-    elif folder.is_dir() and any(folder.iterdir()):
-        names = sorted(entry.name for entry in folder.iterdir())
-        raise InputError(
-            f"{folder}: contains something that is not an unpacked bag ({', '.join(names[:5])}"
-            f"{', ...' if len(names) > 5 else ''}). Choose a new or empty folder as --output."
-        )
-    write_json(path, manifest)
+    open_folder(folder, folder / _MANIFEST, manifest, "unpacked bags")
+    remove_leftovers(folder)
 
 
 class _Unpacking:
@@ -230,28 +208,21 @@ class _Unpacking:
             except InputError as error:
                 self._broken[topic].append(str(error))
 
-    def _is_new(self, topic: str, stamp_ns: int) -> bool:
-        if stamp_ns in self._stamps[topic]:
-            self._twice[topic] += 1
-            return False
-        self._stamps[topic].add(stamp_ns)
-        return True
-
-    def _write(self, topic: str, path: Path, write: Callable[[Path], None]) -> None:
+    def _write(self, topic: Topic, stamp_ns: int, path: Path, write: Callable[[Path], None]) -> None:
+        if stamp_ns in self._stamps[topic.name]:
+            self._twice[topic.name] += 1
+            return
+        self._stamps[topic.name].add(stamp_ns)
         if not path.is_file():
-            self._pending.append((topic, self._pool.submit(write, path)))
+            self._pending.append((topic.name, self._pool.submit(write, path)))
 
     def _take_picture(self, camera: FoundCamera, stamp_ns: int, message: Any) -> None:
-        topic = camera.topic.name
-        if self._is_new(topic, stamp_ns):
-            suffix, write = file_of(message, camera.bits)
-            self._write(topic, self._output / "images" / camera.name / f"{stamp_ns}{suffix}", write)
+        suffix, write = file_of(message, camera.bits)
+        self._write(camera.topic, stamp_ns, self._output / "images" / camera.name / f"{stamp_ns}{suffix}", write)
 
     def _take_scan(self, scanner: FoundScanner, stamp_ns: int, message: Any) -> None:
-        topic = scanner.topic.name
-        if self._is_new(topic, stamp_ns):
-            path = self._output / "lidar" / scanner.name / f"{stamp_ns}.npy"
-            self._write(topic, path, partial(_write_scan, message, scanner, stamp_ns))
+        path = self._output / "lidar" / scanner.name / f"{stamp_ns}.npy"
+        self._write(scanner.topic, stamp_ns, path, partial(_write_scan, message, scanner, stamp_ns))
 
     def _check_broken(self) -> None:
         for topic, faults in self._broken.items():
@@ -315,7 +286,7 @@ class _Unpacking:
         cameras = []
         for camera in self._found.cameras:
             to_vehicle = mounting(fixed, camera.frame, vehicle)
-            if to_vehicle is not None and looks_upward(to_vehicle):
+            if to_vehicle is not None and to_vehicle[2, 2] > _UPWARD:
                 say(
                     self._console,
                     f"{camera.name}: its axis points up. Its frame {camera.frame} seems to have x forward; turn "
@@ -325,23 +296,16 @@ class _Unpacking:
             if to_vehicle is not None and isinstance(camera.lens, Lens):
                 to_vehicle = to_vehicle.copy()
                 to_vehicle[:3, :3] = to_vehicle[:3, :3] @ camera.lens.rotation.T
-            cameras.append((camera, Mounted(to_vehicle, camera.frame)))
-        scanners = [
-            (scanner, Mounted(mounting(fixed, scanner.frame, vehicle), scanner.frame))
-            for scanner in self._found.scanners
-        ]
+            cameras.append((camera, to_vehicle))
+        scanners = [(scanner, mounting(fixed, scanner.frame, vehicle)) for scanner in self._found.scanners]
         write_text(self._output / _RIG, rig_text(self._bag.path.name, vehicle, cameras, scanners, said))
 
     def _vehicle(self, fixed: dict[Edge, Transform], moving: dict[Edge, Poses]) -> str:
         """The frame that all is mounted on."""
-        if self._options.vehicle is not None:
-            return self._options.vehicle
-        if self._child:
-            return self._child
         known = {frame for edge in (*fixed, *moving) for frame in edge}
-        named = next((frame for frame in VEHICLE_FRAMES if frame in known), None)
-        sensors = [*self._found.scanners, *self._found.cameras]
-        return named or next((sensor.frame for sensor in sensors if sensor.frame), "vehicle")
+        named = [frame for frame in VEHICLE_FRAMES if frame in known]
+        mounted = [sensor.frame for sensor in (*self._found.scanners, *self._found.cameras)]
+        return next(filter(None, (self._options.vehicle, self._child, *named, *mounted)), "vehicle")
 
     def _write_poses(self, vehicle: str, fixed: dict[Edge, Transform], moving: dict[Edge, Poses]) -> str | None:
         """Write the poses of the vehicle; say what they are, None without any."""

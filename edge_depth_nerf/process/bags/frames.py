@@ -7,8 +7,7 @@ tree; a chain from one to the other may go up and down. Transforms are 4×4, met
 from __future__ import annotations
 
 from array import array
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,42 +73,19 @@ def matrices(table: Float64[np.ndarray, "poses 8"]) -> Float64[np.ndarray, "pose
     return rigid(Rotation.from_quat(table[:, 4:]).as_matrix(), table[:, 1:4])
 
 
-def chain(edges: Sequence[Edge], source: str, target: str) -> list[tuple[Edge, bool]] | None:
-    """The edges from one frame to another, each with whether it goes up, to the parent; None without a way."""
-    ways: dict[str, list[tuple[Edge, bool]]] = {source: []}
-    waiting = deque([source])
-    while waiting:
-        frame = waiting.popleft()
-        if frame == target:
-            return ways[frame]
-        for edge in edges:
-            parent, child = edge
-            after = parent if child == frame else child if parent == frame else None
-            if after is not None and after not in ways:
-                ways[after] = [*ways[frame], (edge, child == frame)]
-                waiting.append(after)
-    return None
-
-
 def mounting(edges: Mapping[Edge, Transform], source: str, target: str) -> Transform | None:
-    """The transform from a frame to another along mountings; None without a chain."""
-    way = chain(list(edges), source, target)
-    if way is None:
-        return None
-    found = np.eye(4)
-    for edge, up in way:
-        found = (edges[edge] if up else np.linalg.inv(edges[edge])) @ found
-    return found
-
-
-def root_of(edges: Sequence[Edge], frame: str) -> str:
-    """The topmost frame above one."""
-    parents = {child: parent for parent, child in edges}
-    seen = {frame}
-    while frame in parents and parents[frame] not in seen:
-        frame = parents[frame]
-        seen.add(frame)
-    return frame
+    """The transform from a frame to another along mountings, up and down; None without a chain."""
+    found = {source: np.eye(4)}
+    reached = [source]
+    for frame in reached:
+        for (parent, child), child_to_parent in edges.items():
+            if child == frame and parent not in found:
+                found[parent] = child_to_parent @ found[frame]
+                reached.append(parent)
+            elif parent == frame and child not in found:
+                found[child] = np.linalg.inv(child_to_parent) @ found[frame]
+                reached.append(child)
+    return found.get(target)
 
 
 def path_of(
@@ -119,21 +95,23 @@ def path_of(
 
     None if nothing between them moves.
     """
-    edges = [*moving, *fixed]
-    world = root_of(edges, vehicle)
-    way = chain(edges, vehicle, world) or []
-    paths = {edge: poses.table for edge, _ in way if (poses := moving.get(edge)) is not None}
+    parents = {child: parent for parent, child in (*moving, *fixed)}
+    above = [vehicle]
+    while (parent := parents.get(above[-1])) is not None and parent not in above:
+        above.append(parent)
+    way = list(zip(above[1:], above, strict=False))
+    paths = {edge: poses.table for edge in way if (poses := moving.get(edge)) is not None}
     if not paths or min(map(len, paths.values())) < 2:
         return None
     times_s = max(paths.values(), key=len)[:, 0]
     first, last = max(table[0, 0] for table in paths.values()), min(table[-1, 0] for table in paths.values())
     times_s = times_s[(times_s >= first) & (times_s <= last)]
     found = np.tile(np.eye(4), (len(times_s), 1, 1))
-    for edge, _ in way:
+    for edge in way:
         table = paths.get(edge)
         step = fixed[edge] if table is None else Trajectory(table[:, 0], matrices(table)).at(times_s)
         found = step @ found
-    return times_s, found, world
+    return times_s, found, above[-1]
 
 
 def by_satellite(

@@ -20,10 +20,12 @@ from edge_depth_nerf.base.files import write_bytes, write_png
 from edge_depth_nerf.base.jpeg import is_jpeg
 
 # OpenCV names a pattern by the second row's second and third pixel
-_BAYER = {
+_PATTERNS = {
     **{"rggb": cv2.COLOR_BayerBG2RGB, "bggr": cv2.COLOR_BayerRG2RGB},
     **{"gbrg": cv2.COLOR_BayerGR2RGB, "grbg": cv2.COLOR_BayerGB2RGB},
 }
+_BAYER = {f"bayer_{pattern}{bits}": (code, bits) for pattern, code in _PATTERNS.items() for bits in (8, 16)}
+"""OpenCV's code and the bits of each encoding."""
 _CHANNELS: dict[str, tuple[int, int, list[int]]] = {
     **{"mono8": (1, 8, [0]), "8UC1": (1, 8, [0]), "mono16": (1, 16, [0])},
     **{"rgb8": (3, 8, [0, 1, 2]), "bgr8": (3, 8, [2, 1, 0]), "8UC3": (3, 8, [2, 1, 0])},
@@ -41,15 +43,6 @@ _DEPTH = ("16UC1", "32FC1")
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def _bayer_of(encoding: str) -> tuple[int, int] | None:
-    """OpenCV's code and the bits of a Bayer encoding; None for others."""
-    for pattern, code in _BAYER.items():
-        for bits in (8, 16):
-            if encoding == f"bayer_{pattern}{bits}":
-                return code, bits
-    return None
-
-
 def why_no_picture(message: Any) -> str | None:
     """Why messages of this kind are no pictures of a camera; None if they are."""
     if not hasattr(message, "encoding"):
@@ -62,7 +55,7 @@ def why_no_picture(message: Any) -> str | None:
     encoding = message.encoding
     if encoding in _DEPTH:
         return "depth pictures, which are not unpacked"
-    if encoding in _CHANNELS or encoding in _YUV or encoding in _PLANES or _bayer_of(encoding):
+    if encoding in (*_CHANNELS, *_YUV, *_PLANES, *_BAYER):
         return None
     return f"of encoding {encoding or '(empty)'}, which is not known"
 
@@ -75,8 +68,7 @@ def bits_used(messages: Iterable[Any]) -> int:
 
 def _depth(message: Any) -> int:
     encoding = getattr(message, "encoding", "")
-    bayer = _bayer_of(encoding)
-    return bayer[1] if bayer else _CHANNELS.get(encoding, (1, 8, []))[1]
+    return _BAYER.get(encoding, _CHANNELS.get(encoding, (1, 8)))[1]
 
 
 def _samples(message: Any) -> NDArray[np.unsignedinteger]:
@@ -110,8 +102,8 @@ def decode(message: Any, bits: int) -> NDArray[np.uint8]:
     samples, encoding = _samples(message), message.encoding
     if _depth(message) == 16:
         samples = np.minimum(samples.astype(np.uint32) >> (bits - 8), 255).astype(np.uint8)
-    if bayer := _bayer_of(encoding):
-        return _converted(samples, bayer[0])
+    if encoding in _BAYER:
+        return _converted(samples, _BAYER[encoding][0])
     if encoding in _YUV:
         return _converted(samples.reshape(message.height, message.width, 2), _YUV[encoding])
     if encoding in _PLANES:
@@ -127,8 +119,8 @@ def file_of(message: Any, bits: int) -> tuple[str, Callable[[Path], None]]:
         return ".png", lambda path: write_png(path, decode(message, bits))
     pattern = message.format.split(";")[0].strip()
     content = message.data.tobytes()
-    if bayer := _bayer_of(pattern):
-        return ".png", lambda path: write_png(path, _developed(content, bayer[0]))
+    if pattern in _BAYER:
+        return ".png", lambda path: write_png(path, _developed(content, _BAYER[pattern][0]))
     return ".jpg" if is_jpeg(content) else ".png", lambda path: write_bytes(path, _checked(content))
 
 

@@ -3,31 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.process.bags.survey import FoundCamera, FoundScanner
 from edge_depth_nerf.process.rig_file import TODO
 
-_UPWARD = 0.9
-"""A camera whose axis points up so steeply has a frame with x forward, not an optical one."""
-
-
-@dataclass(frozen=True)
-class Mounted:
-    """Where a sensor is."""
-
-    to_vehicle: Transform | None
-    """None if that is not known."""
-    frame: str
-    """Its own frame in the bag."""
-
 
 def rig_text(
     bag: str,
     vehicle: str,
-    cameras: Sequence[tuple[FoundCamera, Mounted]],
-    scanners: Sequence[tuple[FoundScanner, Mounted]],
+    cameras: Sequence[tuple[FoundCamera, Transform | None]],
+    scanners: Sequence[tuple[FoundScanner, Transform | None]],
     poses: str | None,
 ) -> str:
     """The whole file.
@@ -35,7 +21,7 @@ def rig_text(
     Args:
         bag: its name.
         vehicle: the name of the vehicle's frame.
-        cameras: those that were written.
+        cameras: those that were written, with their transforms to the vehicle; None if that is not known.
         scanners: likewise.
         poses: where the poses come from; None if there are none.
     """
@@ -44,14 +30,14 @@ def rig_text(
         lines += ["# The bag has no poses. Add a table [poses], or compute them: --poses lidar or --poses colmap."]
     else:
         lines += [f"# {poses}", "[poses]", 'file = "poses.txt"', 'format = "tum"']
-    for camera, mounted in cameras:
+    for camera, to_vehicle in cameras:
         lines += ["", f"# {camera.topic.name}", f"[cameras.{camera.name}]", f'images = "images/{camera.name}"', *_CLOCK]
         lines += _lens_lines(camera)
-        lines += _mounting_lines(mounted, vehicle)
-    for scanner, mounted in scanners:
+        lines += _mounting_lines(to_vehicle, camera.frame, vehicle)
+    for scanner, to_vehicle in scanners:
         lines += ["", f"# {scanner.topic.name}", f"[lidars.{scanner.name}]", f'scans = "lidar/{scanner.name}"', *_CLOCK]
         lines += _turn_lines(scanner)
-        lines += _mounting_lines(mounted, vehicle)
+        lines += _mounting_lines(to_vehicle, scanner.frame, vehicle)
     if not scanners:
         lines += [
             "",
@@ -99,15 +85,10 @@ def _turn_lines(scanner: FoundScanner) -> list[str]:
     ]
 
 
-def _mounting_lines(mounted: Mounted, vehicle: str) -> list[str]:
-    if mounted.to_vehicle is None:
-        what = f"4 rows of 4 numbers, from its frame ({mounted.frame or 'without name'}) to the vehicle's ({vehicle})"
+def _mounting_lines(to_vehicle: Transform | None, frame: str, vehicle: str) -> list[str]:
+    if to_vehicle is None:
+        what = f"4 rows of 4 numbers, from its frame ({frame or 'without name'}) to the vehicle's ({vehicle})"
         return [_todo("to_vehicle", what)]
     # chains leave the last digits unsure; -0.0 is written as 0
-    numbers = [[round(float(value), 12) + 0.0 for value in row] for row in mounted.to_vehicle]
+    numbers = [[round(float(value), 12) + 0.0 for value in row] for row in to_vehicle]
     return ["to_vehicle = [", *(f"    [{', '.join(f'{value:.12g}' for value in row)}]," for row in numbers), "]"]
-
-
-def looks_upward(to_vehicle: Transform) -> bool:
-    """Whether a camera's axis points up, which a frame with x forward would make of it."""
-    return bool(to_vehicle[2, 2] > _UPWARD)

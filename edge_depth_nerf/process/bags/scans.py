@@ -43,33 +43,12 @@ class PointTimes:
     """stamp: the scan's; 1970: the clock of the stamps; first: another clock, so they count from the first point."""
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Where the numbers of a cloud are."""
-
-    record: np.dtype
-    intensity: str | None
-    time: str | None
-
-
-def layout_of(message: Any) -> _Layout | None:
-    """The fields of a PointCloud2; None if it has no x, y and z."""
-    order = ">" if message.is_bigendian else "<"
+def fields_of(message: Any) -> dict[str, Any]:
+    """The fields of a PointCloud2 by what they mean: x, y, z, and intensity and time if it has them."""
     fields = {field.name: field for field in message.fields if field.datatype in _KINDS}
-    if not {"x", "y", "z"} <= fields.keys():
-        return None
-    intensity = next((name for name in INTENSITY_FIELDS if name in fields), None)
-    time = next((name for name in TIME_FIELDS if name in fields), None)
-    wanted = [name for name in ("x", "y", "z", intensity, time) if name is not None]
-    record = np.dtype(
-        {
-            "names": wanted,
-            "formats": [f"{order}{_KINDS[fields[name].datatype]}" for name in wanted],
-            "offsets": [fields[name].offset for name in wanted],
-            "itemsize": message.point_step,
-        }
-    )
-    return _Layout(record, intensity, time)
+    names = {"x": ("x",), "y": ("y",), "z": ("z",), "intensity": INTENSITY_FIELDS, "time": TIME_FIELDS}
+    found = {key: next((fields[name] for name in given if name in fields), None) for key, given in names.items()}
+    return {key: field for key, field in found.items() if field is not None}
 
 
 def columns_of(message: Any) -> dict[str, NDArray]:
@@ -80,12 +59,20 @@ def columns_of(message: Any) -> dict[str, NDArray]:
     """
     if not hasattr(message, "point_step"):
         return _livox_columns(message)
+    fields = fields_of(message)
+    if not fields.keys() >= {*"xyz"}:
+        raise InputError("has no fields x, y and z")
+    order = ">" if message.is_bigendian else "<"
+    record = {
+        "names": [*fields],
+        "formats": [f"{order}{_KINDS[field.datatype]}" for field in fields.values()],
+        "offsets": [field.offset for field in fields.values()],
+        "itemsize": message.point_step,
+    }
     try:
-        layout = layout_of(message)
+        kind = np.dtype(record)
     except ValueError as error:
         raise InputError(f"its fields do not fit into {message.point_step} bytes a point ({error})") from None
-    if layout is None:
-        raise InputError("has no fields x, y and z")
     width, height, step = message.width, message.height, message.row_step
     row = width * message.point_step
     if height == 1 or step < row:
@@ -94,10 +81,9 @@ def columns_of(message: Any) -> dict[str, NDArray]:
     if count > MAX_POINTS or step * (height - 1) + row > len(message.data):
         raise InputError(f"{len(message.data)} bytes cannot hold {height} rows of {width} points")
     content = np.frombuffer(bytes(message.data), np.uint8)
-    rows = [content[line * step : line * step + row].view(layout.record) for line in range(height)]
+    rows = [content[line * step : line * step + row].view(kind) for line in range(height)]
     points = np.concatenate(rows) if len(rows) > 1 else rows[0]
-    names = {"x": "x", "y": "y", "z": "z", "intensity": layout.intensity, "time": layout.time}
-    return {name: points[field] for name, field in names.items() if field is not None}
+    return {name: points[name] for name in fields}
 
 
 def _livox_columns(message: Any) -> dict[str, NDArray]:
@@ -113,8 +99,8 @@ def time_field(message: Any) -> str | None:
     """The field with the points' times, if there is one."""
     if not hasattr(message, "point_step"):
         return "offset_time"
-    layout = layout_of(message)
-    return layout.time if layout else None
+    field = fields_of(message).get("time")
+    return field and field.name
 
 
 def find_times(

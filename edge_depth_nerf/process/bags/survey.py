@@ -122,11 +122,7 @@ def look_at(bag: Bag, options: UnpackOptions) -> Survey:
             by_type.setdefault(topic.type, []).append(topic)
     for topic in bag.topics:
         found.taken[topic.name] = _default(topic)
-    infos = [(topic, *_first(bag, topic.name)) for topic in by_type.get(INFO, [])]
-    taken_infos = _find_cameras(bag, options, found, by_type, [(topic, message) for topic, _, message in infos])
-    for topic, _, _ in infos:
-        used = [camera.name for camera in found.cameras if taken_infos.get(camera.name) == topic.name]
-        found.taken[topic.name] = f"calibration of {', '.join(used)}" if used else "calibration, of no camera taken"
+    _find_cameras(bag, options, found, by_type)
     _find_scanners(bag, options, found, by_type)
     _find_mountings(bag, found, by_type)
     _find_poses(options, found, by_type)
@@ -149,11 +145,6 @@ def _default(topic: Topic) -> str:
     if topic.type in PACKETS:
         return "nothing: packets of a scanner; play the bag through its driver, and record its points"
     return "nothing" if topic.readable else "nothing: of a type that is not known"
-
-
-def _first(bag: Bag, topic: str) -> tuple[int, Any]:
-    _, recorded_ns, message = next(bag.messages([topic]))
-    return recorded_ns, message
 
 
 def _peek(bag: Bag, options: UnpackOptions, topic: Topic) -> list[tuple[int, Any]]:
@@ -184,14 +175,9 @@ def _named(topics: Sequence[Topic], used: set[str]) -> Iterator[tuple[Topic, str
         yield topic, free
 
 
-def _find_cameras(
-    bag: Bag,
-    options: UnpackOptions,
-    found: Survey,
-    by_type: dict[str, list[Topic]],
-    infos: list[tuple[Topic, Any]],
-) -> dict[str, str]:
-    """Find the cameras; give the topic of each one's calibration."""
+def _find_cameras(bag: Bag, options: UnpackOptions, found: Survey, by_type: dict[str, list[Topic]]) -> None:
+    """Find the cameras and their calibration."""
+    infos = [(topic, next(bag.messages([topic.name]))[2]) for topic in by_type.get(INFO, [])]
     peeked: dict[str, list[tuple[int, Any]]] = {}
     groups: dict[tuple[str, ...], list[Topic]] = {}
     for topic in (*by_type.get(IMAGE, []), *by_type.get(COMPRESSED, [])):
@@ -212,7 +198,7 @@ def _find_cameras(
         for other in group:
             if other != best:
                 found.taken[other.name] = f"nothing: the same camera as {best.name}; --topics chooses"
-    taken_infos = {}
+    used: dict[str, list[str]] = {topic.name: [] for topic, _ in infos}
     for topic, name in _named(chosen, set()):
         messages = peeked[topic.name]
         first = messages[0][1]
@@ -224,12 +210,13 @@ def _find_cameras(
         info = _info_of(topic.name, frame, infos)
         lens: Lens | str = "the bag has no CameraInfo for it"
         if info is not None:
-            taken_infos[name] = info[0].name
+            used[info[0].name].append(name)
             lens = lens_of(info[1], width, height, "rect" in topic.name)
         bits = bits_used(message for _, message in messages)
         found.cameras.append(FoundCamera(topic, name, frame, width, height, bits, lens))
         found.taken[topic.name] = f"pictures of {name}"
-    return taken_infos
+    for info_topic, names in used.items():
+        found.taken[info_topic] = f"calibration of {', '.join(names)}" if names else "calibration, of no camera taken"
 
 
 def _info_of(topic: str, frame: str, infos: list[tuple[Topic, Any]]) -> tuple[Topic, Any] | None:
@@ -256,7 +243,7 @@ def _find_scanners(bag: Bag, options: UnpackOptions, found: Survey, by_type: dic
         messages = _peek(bag, options, topic)
         if len(messages) < 2 and not options.topics:
             found.taken[topic.name] = "nothing: a single cloud, not scans"
-        elif topic.type == CLOUD and messages and scans.layout_of(messages[0][1]) is None:
+        elif topic.type == CLOUD and messages and not {*"xyz"} <= scans.fields_of(messages[0][1]).keys():
             found.taken[topic.name] = "nothing: clouds without fields x, y and z"
         elif messages:
             candidates.append((topic, messages))

@@ -110,8 +110,6 @@ class ColmapLens:
     parameters: tuple[float, ...]
     theta_max_rad: float
     """Up to which it is used."""
-    rms_px: float
-    """How far it is from the camera it stands for."""
 
 
 @functools.lru_cache(maxsize=64)
@@ -128,14 +126,10 @@ def colmap_lens(camera: Camera, theta_max_rad: float = math.radians(THETA_MAX_DE
     if isinstance(camera, Pinhole) and not camera.k4:
         k = camera
         parameters = (k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2, k.k3, 0.0, 0.0, 0.0)
-        return ColmapLens("FULL_OPENCV", parameters, limit, 0.0)
-    if isinstance(camera, KannalaBrandt):
-        k, rms = camera, 0.0
-    else:
-        fit = fit_kannala_brandt(camera, limit)
-        k, rms = fit.camera, fit.rms_px
+        return ColmapLens("FULL_OPENCV", parameters, limit)
+    k = camera if isinstance(camera, KannalaBrandt) else fit_kannala_brandt(camera, limit).camera
     parameters = (k.fx, k.fy, k.cx, k.cy, k.k1, k.k2, k.p1, k.p2, k.k3, k.k4, 0.0, 0.0)
-    return ColmapLens("THIN_PRISM_FISHEYE", parameters, limit, rms)
+    return ColmapLens("THIN_PRISM_FISHEYE", parameters, limit)
 
 
 def colmap_lenses(recording: Recording, options: ProcessOptions) -> dict[str, ColmapLens]:
@@ -206,9 +200,9 @@ def find_models(recording: Recording, options: ProcessOptions, folder: Path, con
 
 
 def file_stamp(path: Path) -> list:
-    """What tells a file from another version of it without reading it: its place, size and time of change."""
+    """What tells a file from another version of it, wherever the drive lies: names, size and time of change."""
     found = path.stat()
-    return [str(path.absolute()), found.st_size, found.st_mtime_ns]
+    return [path.parent.name, path.name, found.st_size, found.st_mtime_ns]
 
 
 def shared_views(recording: Recording, lenses: Mapping[str, ColmapLens]) -> set[tuple[str, str]]:
@@ -222,6 +216,32 @@ def shared_views(recording: Recording, lenses: Mapping[str, ColmapLens]) -> set[
             if reach - math.acos(np.clip(between, -1, 1)) >= math.radians(_SHARED_VIEW_DEG):
                 shared.add((first.name, second.name))
     return shared
+
+
+def pairs_to_match(
+    recording: Recording, lenses: Mapping[str, ColmapLens], apart: Sequence[int], across: Sequence[int]
+) -> list[tuple[int, int]]:
+    """Pictures to match, as indices, in the order of the drive.
+
+    Args:
+        recording: whose pictures.
+        lenses: of its cameras.
+        apart: how many frames lie between two pictures of one camera; 1 is the next.
+        across: likewise between those of two cameras that share views.
+    """
+    pictures, shared = recording.pictures, shared_views(recording, lenses)
+    cameras = dict.fromkeys(picture.camera for picture in pictures)
+    number_of = {frame: number for number, frame in enumerate(sorted({p.frame for p in pictures}))}
+    seen = {(p.camera, number_of[p.frame]): index for index, p in enumerate(pictures)}
+    pairs = []
+    for (camera, number), index in sorted(seen.items(), key=lambda item: item[0][1]):
+        for other in cameras:
+            related = {(camera, other), (other, camera)} & shared
+            for offset in apart if other == camera else across if related else ():
+                later = seen.get((other, number + offset))
+                if later is not None and (offset > 0 or later > index):
+                    pairs.append((index, later))
+    return pairs
 
 
 class _Run:
@@ -241,7 +261,6 @@ class _Run:
         self.lenses = colmap_lenses(recording, options)
         limits_rad = {name: lens.theta_max_rad for name, lens in self.lenses.items()}
         self.feature_masks = FeatureMasks(recording, options, limits_rad)
-        self.shared_views = shared_views(recording, self.lenses)
         # COLMAP names pictures by their paths below one folder, and a space ends a name
         self.pictures = folder / "pictures"
         self.names = [f"{p.camera}/{p.frame:010d}{p.path.suffix.lower()}" for p in recording.pictures]
@@ -269,7 +288,7 @@ class _Run:
             [p.camera, p.frame, *(path and file_stamp(path) for path in (p.path, p.mask))]
             for p in self.recording.pictures
         ]
-        related = [_NEIGHBOURS, sorted(self.shared_views)]
+        related = [_NEIGHBOURS, sorted(shared_views(self.recording, self.lenses))]
         content = json.dumps([_VERSION, self.pycolmap.__version__, cameras, pictures, related])
         return hashlib.sha256(content.encode()).hexdigest()
 
@@ -357,7 +376,7 @@ class _Run:
         geometry.stationary_matches_max_error = 1.0
         pairing = colmap.ImportedPairingOptions()
         pairing.match_list_path = self.folder / "pairs.txt"
-        pairs = self._pairs()
+        pairs = pairs_to_match(self.recording, self.lenses, _NEIGHBOURS, (0, *_NEIGHBOURS))
         with progress_bars(self.console, counted=True) as progress:
             task = progress.add_task("Matching pictures", total=len(pairs))
             for chunk in _chunks(pairs, _CHUNK_PAIRS):
@@ -367,38 +386,20 @@ class _Run:
                 )
                 progress.advance(task, len(chunk))
 
-    def _pairs(self) -> list[tuple[int, int]]:
-        """Pictures to match, as indices."""
-        pictures, shared = self.recording.pictures, self.shared_views
-        number_of = {frame: number for number, frame in enumerate(sorted({p.frame for p in pictures}))}
-        seen: dict[tuple[str, int], int] = {(p.camera, number_of[p.frame]): i for i, p in enumerate(pictures)}
-        pairs = []
-        for (camera, frame), index in seen.items():
-            for offset in (0, *_NEIGHBOURS):
-                for other in self.recording.cameras:
-                    related = other.name == camera or bool({(camera, other.name), (other.name, camera)} & shared)
-                    later = seen.get((other.name, frame + offset))
-                    if related and later is not None and (offset > 0 or later > index):
-                        pairs.append((index, later))
-        return pairs
-
     def map(self) -> None:
         """Find poses and points with fixed lenses; by the number of points that gives more pictures their pose."""
-        kept, most = self.folder / "models.kept", -1
-        shutil.rmtree(kept, ignore_errors=True)
+        tried: dict[Path, int] = {}
         for pose_points in _POSE_POINTS:
-            unfinished = self._map(pose_points)
-            placed = {index for model in self.read_models(unfinished) for index in model.placed()}
-            if len(placed) > most:
-                shutil.rmtree(kept, ignore_errors=True)
-                os.replace(unfinished, kept)
-                most = len(placed)
-            if most >= _ENOUGH * len(self.names):
+            made = self._map(pose_points)
+            tried[made] = len({index for model in self.read_models(made) for index in model.placed()})
+            if tried[made] >= _ENOUGH * len(self.names):
                 break
-        write_json(self.folder / _MODELS_SUM, {"sha256": sum_of_files(kept)})
+        best = max(tried, key=lambda made: tried[made])
+        write_json(self.folder / _MODELS_SUM, {"sha256": sum_of_files(best)})
         shutil.rmtree(self.models, ignore_errors=True)
-        os.replace(kept, self.models)
-        shutil.rmtree(self.folder / "models.unfinished", ignore_errors=True)
+        os.replace(best, self.models)
+        for unfinished in self.folder.glob("models.[0-9]*"):
+            shutil.rmtree(unfinished, ignore_errors=True)
 
     def _map(self, pose_points: int) -> Path:
         """Run COLMAP's mapper; gives the folder with what it wrote."""
@@ -423,7 +424,7 @@ class _Run:
         options.mapper.init_min_tri_angle = 8.0
         options.triangulation.merge_max_reproj_error = error_px
         options.triangulation.complete_max_reproj_error = error_px
-        unfinished = self.folder / "models.unfinished"
+        unfinished = self.folder / f"models.{pose_points}"
         shutil.rmtree(unfinished, ignore_errors=True)
         unfinished.mkdir()
         with progress_bars(self.console, counted=True) as progress:

@@ -18,23 +18,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 from rich.console import Console
 
-from edge_depth_nerf.base.bounds import finite
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.files import read_image, read_json, sha256_of, write_json
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.poses.matches import Matches, PosedPicture, epipolar_distance_px, match_pictures
+from edge_depth_nerf.poses.matches import Matches, epipolar_distance_px, match_pictures
 from edge_depth_nerf.poses.tracks import Tracks, features_joined, join_matches, reprojection_px, spread, triangulate
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, adjust_bundle
-from edge_depth_nerf.process.colmap.models import colmap_lenses, file_stamp, import_pycolmap, shared_views
+from edge_depth_nerf.process.colmap.models import colmap_lenses, file_stamp, import_pycolmap, pairs_to_match
 from edge_depth_nerf.process.colmap.scale import frame_times
-from edge_depth_nerf.process.feature_masks import FeatureMasks
+from edge_depth_nerf.process.feature_masks import FeatureMasks, posed_pictures
 from edge_depth_nerf.process.options import ProcessOptions
 from edge_depth_nerf.process.reading import read_if_whole
 from edge_depth_nerf.process.recording import RecordedPicture, Recording
@@ -50,8 +48,8 @@ FURTHEST_DEG = 1.5
 LEAST_GAIN = 0.05
 """The features that took no part must come nearer to their curves by this share; less is chance."""
 
-_VERSION = 2
-"""Of what is done with the inputs; raised when results change."""
+_VERSION = 3
+"""Of what is done with the inputs, and of the file; raised when results change."""
 _APART = (1, 2, 3, 5, 8)
 """So many frames lie between the matched pictures of one camera; 1 is the next."""
 _ACROSS = (0, 1, 2)
@@ -82,17 +80,11 @@ class Refinement:
     points: int
     """Points in the bundle."""
     before_px: float
-    """Median distance to the epipolar curves of features that took no part, with the given poses; NaN for too few."""
+    """Median distance to the epipolar curves of features that took no part, with the given poses; 0 without any."""
     after_px: float
     """The same with the refined ones."""
     checks: int
     """How many matches these medians are of."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON; a median that is not known is null."""
-        arrays = {"vehicle_to_world": self.vehicle_to_world.tolist(), "supported": self.supported.tolist()}
-        medians = {"before_px": finite(self.before_px), "after_px": finite(self.after_px)}
-        return {**arrays, "points": self.points, "judges": self.checks, **medians}
 
 
 def refine_poses(recording: Recording, options: ProcessOptions, console: Console) -> Recording:
@@ -125,10 +117,11 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
     digest = _digest(pycolmap.__version__, recording, options, given)
     found = _read_refinement(options.output / REFINED_POSES, digest)
     if found is None:
-        matches = _match(recording, shots, given, options, console)
+        matches = _match(recording, options, console)
         with console.status("Refining the poses …"):
             found = refine(pycolmap, shots, matches, given, reshoot=reshoot)
-        write_json(options.output / REFINED_POSES, {"digest": digest, **found.to_dict()})
+        arrays = {"vehicle_to_world": found.vehicle_to_world.tolist(), "supported": found.supported.tolist()}
+        write_json(options.output / REFINED_POSES, {"digest": digest, **vars(found), **arrays})
     if found.checks < _LEAST_CHECKS:
         return _kept(recording, f"only {found.checks} features could be matched for the check")
     distances = f"{found.before_px:.2f} px before, {found.after_px:.2f} px after"
@@ -177,15 +170,11 @@ def _digest(
         for c in recording.cameras
     ]
     pictures = [
-        [p.camera, p.frame, recording.pose(p).tolist(), *map(_stamp, (p.path, p.mask))] for p in recording.pictures
+        [p.camera, p.frame, recording.pose(p).tolist(), file_stamp(p.path), p.mask and file_stamp(p.mask)]
+        for p in recording.pictures
     ]
     rest = [_VERSION, version, given.tolist(), options.theta_max_deg, *options.holdout_cameras]
     return hashlib.sha256(json.dumps([cameras, pictures, rest]).encode()).hexdigest()
-
-
-def _stamp(path: Path | None) -> list | None:
-    """What tells a file from another version of it, wherever the drive lies."""
-    return None if path is None else [path.parent.name, path.name, *file_stamp(path)[1:]]
 
 
 def _read_refinement(path: Path, digest: str) -> Refinement | None:
@@ -193,15 +182,10 @@ def _read_refinement(path: Path, digest: str) -> Refinement | None:
     found = read_json(path) if path.is_file() else None
     if not isinstance(found, dict) or found.get("digest") != digest:
         return None
-    before_px, after_px = (math.nan if found[key] is None else found[key] for key in ("before_px", "after_px"))
-    return Refinement(
-        vehicle_to_world=np.array(found["vehicle_to_world"], np.float64),
-        supported=np.array(found["supported"], bool),
-        points=found["points"],
-        before_px=before_px,
-        after_px=after_px,
-        checks=found["judges"],
-    )
+    del found["digest"]
+    for key in ("vehicle_to_world", "supported"):
+        found[key] = np.array(found[key])
+    return Refinement(**found)
 
 
 # ---- what the pictures share -----------------------------------------------------------------------------------
@@ -218,30 +202,14 @@ def _shots(recording: Recording, frames: Sequence[int], given: Float64[np.ndarra
     ]
 
 
-def _match(
-    recording: Recording,
-    shots: Sequence[Shot],
-    given: Float64[np.ndarray, "frames 4 4"],
-    options: ProcessOptions,
-    console: Console,
-) -> list[Matches]:
+def _match(recording: Recording, options: ProcessOptions, console: Console) -> list[Matches]:
     """Match the pictures that were taken shortly after one another."""
     lenses = colmap_lenses(recording, options)
     masks = FeatureMasks(recording, options, {name: lens.theta_max_rad for name, lens in lenses.items()})
-    posed = [
-        PosedPicture(
-            camera=picture.camera,
-            frame=shot.frame,
-            lens=shot.lens,
-            camera_to_world=pose,
-            read_rgb=partial(_read, picture, shot.lens, options.strict),
-            read_usable=partial(masks.of, picture),
-        )
-        for picture, shot, pose in zip(recording.pictures, shots, _camera_poses(shots, given), strict=True)
-    ]
+    posed = posed_pictures(recording, masks, partial(_read, strict=options.strict))
     pairs = [
         (one, other)
-        for one, other in _pairs(posed, shared_views(recording, lenses))
+        for one, other in pairs_to_match(recording, lenses, _APART, _ACROSS)
         if not {posed[one].camera, posed[other].camera} & {*options.holdout_cameras}
     ]
     found = []
@@ -260,25 +228,6 @@ def _read(picture: RecordedPicture, lens: Camera, strict: bool) -> np.ndarray:
     if rgb is None or rgb.shape[:2] != (lens.height, lens.width):
         return np.zeros((lens.height, lens.width, 3), np.uint8)
     return rgb
-
-
-def _pairs(pictures: Sequence[PosedPicture], shared: set[tuple[str, str]]) -> list[tuple[int, int]]:
-    """Pictures to match, as indices, in the order of the drive."""
-    seen = {(picture.camera, picture.frame): index for index, picture in enumerate(pictures)}
-    pairs = []
-    for (camera, frame), index in sorted(seen.items(), key=lambda item: item[0][1]):
-        for other in dict.fromkeys(picture.camera for picture in pictures):
-            if other == camera:
-                offsets: Sequence[int] = _APART
-            elif {(camera, other), (other, camera)} & shared:
-                offsets = _ACROSS
-            else:
-                continue
-            for offset in offsets:
-                later = seen.get((other, frame + offset))
-                if later is not None and (offset > 0 or later > index):
-                    pairs.append((index, later))
-    return pairs
 
 
 # ---- the bundle ------------------------------------------------------------------------------------------------
@@ -339,7 +288,7 @@ def _median_px(
     distances = [epipolar_distance_px(found, poses[found.first], poses[found.second]) for found in checks]
     known = np.concatenate([np.zeros(0), *distances])
     known = known[np.isfinite(known)]
-    return (float(np.median(known)) if len(known) else math.nan), len(known)
+    return (float(np.median(known)) if len(known) else 0.0), len(known)
 
 
 def _tracks(

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.base.bounds import shown, text_lines
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.cameras.transforms import Transform, check_rigid, rigid
+from edge_depth_nerf.cameras.transforms import Transform, rigid
 from edge_depth_nerf.process.poses import finite_number, transform_of_rows
 
 EARTH_RADIUS_M = 6378137.0
@@ -29,18 +28,6 @@ EARTH_RADIUS_M = 6378137.0
 _AGAIN = "Copy the file again from the data set."
 
 Values = dict[str, Float64[np.ndarray, "values"]]
-
-
-@dataclass(frozen=True)
-class RectifiedCamera:
-    """A camera of rectified pictures, with the first pixel's centre at 0."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    to_camera_0: Transform
-    """From its frame to that of the rectified camera 0."""
 
 
 def read_values(path: Path) -> Values:
@@ -62,7 +49,12 @@ def read_values(path: Path) -> Values:
     return values
 
 
-def _matrix(values: Values, key: str, shape: tuple[int, int], path: Path) -> Float64[np.ndarray, "rows columns"]:
+def matrix_of(values: Values, key: str, shape: tuple[int, int], path: Path) -> Float64[np.ndarray, "rows columns"]:
+    """The numbers of a line as a matrix.
+
+    Raises:
+        InputError: the line is missing, or has other numbers.
+    """
     if key not in values:
         raise InputError(f"{path}: has no line {key}; there are {', '.join(values) or 'none'}. {_AGAIN}")
     found = values[key]
@@ -79,43 +71,26 @@ def read_rigid(path: Path) -> Transform:
         InputError: no rotation and translation.
     """
     values = read_values(path)
-    rows = np.hstack((_matrix(values, "R", (3, 3), path), _matrix(values, "T", (3, 1), path)))
+    rows = np.hstack((matrix_of(values, "R", (3, 3), path), matrix_of(values, "T", (3, 1), path)))
     return transform_of_rows(rows, f"{path}: R and T")
 
 
-def read_rectification(values: Values, path: Path) -> Transform:
-    """The turn from camera 0 to the rectified camera 0.
+def read_projection(values: Values, key: str, path: Path) -> tuple[dict[str, float], Transform]:
+    """A camera of rectified pictures from its projection matrix P.
 
-    Raises:
-        InputError: it is missing, or no rotation.
-    """
-    turn = rigid(_matrix(values, "R_rect_00", (3, 3), path))
-    check_rigid(turn, f"{path}: R_rect_00")
-    return turn
-
-
-def read_projection(values: Values, key: str, path: Path) -> RectifiedCamera:
-    """A camera from its projection matrix P.
+    Returns:
+        fx, fy, cx, cy, with the first pixel's centre at 0; and from its frame to that of the rectified camera 0.
 
     Raises:
         InputError: it is missing, or no projection of a rectified camera.
     """
-    projection = _matrix(values, key, (3, 4), path)
+    projection = matrix_of(values, key, (3, 4), path)
     lens, column = projection[:, :3], projection[:, 3]
     wrong = lens[2].tolist() != [0, 0, 1] or lens[0, 1] != 0 or lens[1, 0] != 0 or min(lens[0, 0], lens[1, 1]) <= 0
     if wrong:
         raise InputError(f"{path}: {key} is no projection of rectified pictures (fx 0 cx; 0 fy cy; 0 0 1). {_AGAIN}")
     to_camera_0 = rigid(np.eye(3), -np.linalg.solve(lens, column))
-    return RectifiedCamera(lens[0, 0], lens[1, 1], lens[0, 2], lens[1, 2], to_camera_0)
-
-
-def read_transform(values: Values, key: str, path: Path) -> Transform:
-    """A 3×4 matrix of rotation and translation, such as Tr of the odometry benchmark.
-
-    Raises:
-        InputError: it is missing, or no rotation and translation.
-    """
-    return transform_of_rows(_matrix(values, key, (3, 4), path), f"{path}: {key}")
+    return {"fx": lens[0, 0], "fy": lens[1, 1], "cx": lens[0, 2], "cy": lens[1, 2]}, to_camera_0
 
 
 def read_oxts(folder: Path) -> dict[int, Transform]:

@@ -27,7 +27,6 @@ import re
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -35,21 +34,12 @@ import numpy as np
 
 from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.base.files import picture_head
-from edge_depth_nerf.cameras.transforms import Transform
+from edge_depth_nerf.cameras.transforms import Transform, check_rigid, rigid
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.process.kitti.calibration import (
-    RectifiedCamera,
-    read_oxts,
-    read_projection,
-    read_rectification,
-    read_rigid,
-    read_transform,
-    read_values,
-)
-from edge_depth_nerf.process.kitti360.calibration import read_timestamps
+from edge_depth_nerf.process.kitti.calibration import matrix_of, read_oxts, read_projection, read_rigid, read_values
 from edge_depth_nerf.process.options import KittiOptions
+from edge_depth_nerf.process.poses import read_frame_times, transform_of_rows
 from edge_depth_nerf.process.poses import read_kitti as read_kitti_poses
-from edge_depth_nerf.process.poses import read_times
 from edge_depth_nerf.process.recording import Recording
 from edge_depth_nerf.process.rig import Numbered, recording_of_rig, upright_world
 from edge_depth_nerf.process.rig_file import rig_of
@@ -69,8 +59,10 @@ class _Layout:
     """Files whose bytes decide about the scene."""
     times_file: Path
     times_s: Sequence[float]
-    lenses: dict[str, RectifiedCamera]
-    """Of the cameras."""
+    lenses: dict[str, tuple[dict[str, float], Transform]]
+    """Of the cameras: their numbers, and from their frames to the rectified camera 0."""
+    sizes: dict[str, list[int]]
+    """Width and height of their pictures, where the calibration has them."""
     folders: dict[str, Path]
     """Of the cameras' pictures."""
     scans: Path
@@ -94,7 +86,6 @@ def read_kitti(options: KittiOptions) -> Recording:
         FileNotFoundError: a folder or file of the drive is missing.
         InputError: an option or a file of the drive cannot be used.
     """
-    options.check()
     names = options.cameras
     if not (len(set(names)) == len(names) > 0 and set(names) <= set(CAMERAS)):
         raise InputError(f"--cameras {' '.join(names)}: expected some of {', '.join(CAMERAS)}.")
@@ -130,15 +121,20 @@ def _description(layout: _Layout, options: KittiOptions) -> dict[str, Any]:
         return (layout.camera_0_to_vehicle @ to_camera_0).tolist()
 
     cameras = {}
-    for name, lens in layout.lenses.items():
+    for name, (lens, to_camera_0) in layout.lenses.items():
         first = min(layout.folders[name].glob("*.png"), default=None)
         if first is None:
             raise FileNotFoundError(f"{layout.folders[name]}: no .png; the pictures of {name} belong there.")
         width, height, *_ = picture_head(first)
+        # it differs from day to day
+        if layout.sizes and (size := layout.sizes[name]) != [width, height]:
+            raise InputError(
+                f"{layout.calibration[0]}: S_rect_{name[-2:]} is {'×'.join(map(str, size)) or 'missing'}, but {first} "
+                f"has {width}×{height} pixels. The calibration is of another day, or the pictures were resized."
+            )
         cameras[name] = {
             **{"images": str(layout.folders[name].relative_to(options.root)), "times_file": times_file},
-            **{"model": "pinhole", "width": width, "height": height},
-            **{"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy, "to_vehicle": mounted(lens.to_camera_0)},
+            **{"model": "pinhole", "width": width, "height": height, **lens, "to_vehicle": mounted(to_camera_0)},
         }
     scanner = {
         **{"scans": str(layout.scans.relative_to(options.root) / "*.bin"), "times_file": times_file},
@@ -162,13 +158,6 @@ def _path(layout: _Layout) -> Trajectory:
         )
 
 
-def _increasing(times_s: Sequence[float], path: Path) -> Sequence[float]:
-    for line, (before, time) in enumerate(pairwise(times_s), 2):
-        if not time > before:
-            raise InputError(f"{path}, line {line}: not after the line before. Copy the file again from the data set.")
-    return times_s
-
-
 def _raw(options: KittiOptions) -> _Layout:
     """What a drive of the raw data says."""
     day = options.root / options.sequence[:10]
@@ -183,16 +172,20 @@ def _raw(options: KittiOptions) -> _Layout:
     )
     values = read_values(lenses_file)
     lenses = {name: read_projection(values, f"P_rect_{name[-2:]}", lenses_file) for name in options.cameras}
-    _check_crop(values, folders, lenses_file)
-    velodyne_to_camera_0 = read_rectification(values, lenses_file) @ read_rigid(velo_file)
+    # from camera 0 to the rectified camera 0
+    turn = rigid(matrix_of(values, "R_rect_00", (3, 3), lenses_file))
+    check_rigid(turn, f"{lenses_file}: R_rect_00")
+    velodyne_to_camera_0 = turn @ read_rigid(velo_file)
     scans = drive / "velodyne_points"
-    times_s = _increasing(read_timestamps(scans / "timestamps.txt"), scans / "timestamps.txt")
+    times_file = scans / "timestamps.txt"
+    times_s = read_frame_times(times_file)
     turn_s = statistics.median(np.diff(times_s).tolist()) if len(times_s) > 1 else 0.1
     return _Layout(
         calibration=(lenses_file, velo_file, imu_file),
-        times_file=scans / "timestamps.txt",
+        times_file=times_file,
         times_s=times_s,
         lenses=lenses,
+        sizes={name: values.get(f"S_rect_{name[-2:]}", np.zeros(0)).astype(int).tolist() for name in options.cameras},
         folders=folders,
         scans=scans / "data",
         velodyne_to_camera_0=velodyne_to_camera_0,
@@ -201,22 +194,6 @@ def _raw(options: KittiOptions) -> _Layout:
         poses_file=drive / "oxts" / "data",
         poses=lambda: read_oxts(drive / "oxts" / "data"),
     )
-
-
-def _check_crop(values: dict[str, np.ndarray], folders: dict[str, Path], path: Path) -> None:
-    """Check that the calibration is of the pictures' size, which differs from day to day.
-
-    Raises:
-        InputError: it is of another one.
-    """
-    for name, folder in folders.items():
-        size = values.get(f"S_rect_{name[-2:]}", np.zeros(0)).astype(int).tolist()
-        first = min(folder.glob("*.png"), default=None)
-        if first is not None and (there := list(picture_head(first)[:2])) != size:
-            raise InputError(
-                f"{path}: S_rect_{name[-2:]} is {'×'.join(map(str, size)) or 'missing'}, but {first} has "
-                f"{'×'.join(map(str, there))} pixels. The calibration is of another day, or the pictures were resized."
-            )
 
 
 def _odometry(options: KittiOptions) -> _Layout:
@@ -243,11 +220,12 @@ def _odometry(options: KittiOptions) -> _Layout:
     return _Layout(
         calibration=(calibration,),
         times_file=times_file,
-        times_s=_increasing([time for _, time in read_times(times_file)], times_file),
+        times_s=read_frame_times(times_file),
         lenses={name: read_projection(values, f"P{name[-1]}", calibration) for name in options.cameras},
+        sizes={},
         folders=folders,
         scans=sequence / "velodyne",
-        velodyne_to_camera_0=read_transform(values, "Tr", calibration),
+        velodyne_to_camera_0=transform_of_rows(matrix_of(values, "Tr", (3, 4), calibration), f"{calibration}: Tr"),
         camera_0_to_vehicle=np.eye(4),
         scanner={"corrected_to": "timestamp"},
         poses_file=poses_file,

@@ -8,7 +8,6 @@ Each error names the file and the line.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,8 @@ from edge_depth_nerf.base.bounds import shown, text_lines
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import MEI
 from edge_depth_nerf.cameras.transforms import Transform
-from edge_depth_nerf.process.poses import finite_number, seconds_of_date, transform_of_rows
+from edge_depth_nerf.process.poses import finite_number, transform_of_rows
+from edge_depth_nerf.process.recording import RecordedCamera
 
 _MEI_FIELDS = {
     "mirror_parameters": ("xi",),
@@ -30,20 +30,11 @@ _MAX_FRAME = 10**10
 """Numbers of frames have ten digits."""
 
 
-@dataclass(frozen=True)
-class Kitti360Rig:
-    """Where the cameras and the scanner sit on the vehicle."""
+def read_rig(calibration: Path, cameras: tuple[str, ...]) -> tuple[dict[str, RecordedCamera], Transform]:
+    """Read what the folder `calibration` says of some fisheye cameras and the scanner.
 
-    cameras: dict[str, MEI]
-    """The fisheye cameras at their full size."""
-    camera_to_pose: dict[str, Transform]
-    """From each camera's frame to the vehicle's."""
-    velo_to_pose: Transform
-    """From the scanner's frame to the vehicle's."""
-
-
-def read_rig(calibration: Path, cameras: tuple[str, ...]) -> Kitti360Rig:
-    """Read what the folder `calibration` says of the scanner and some fisheye cameras.
+    Returns:
+        The cameras by name, at their full size, and the transform from the scanner's frame to the vehicle's.
 
     Raises:
         FileNotFoundError: a file is missing.
@@ -57,11 +48,11 @@ def read_rig(calibration: Path, cameras: tuple[str, ...]) -> Kitti360Rig:
                 f"{pose_file}: has no line for {name}, only for {', '.join(camera_to_pose) or 'nothing'}. {_DOWNLOAD}"
             )
     cam0_to_velo = read_cam_to_velo(calibration / "calib_cam_to_velo.txt")
-    return Kitti360Rig(
-        cameras={name: read_mei_camera(calibration / f"{name}.yaml") for name in cameras},
-        camera_to_pose={name: camera_to_pose[name] for name in cameras},
-        velo_to_pose=camera_to_pose["image_00"] @ np.linalg.inv(cam0_to_velo),
-    )
+    found = {
+        name: RecordedCamera(name, read_mei_camera(calibration / f"{name}.yaml"), camera_to_pose[name])
+        for name in cameras
+    }
+    return found, camera_to_pose["image_00"] @ np.linalg.inv(cam0_to_velo)
 
 
 def read_mei_camera(path: Path) -> MEI:
@@ -87,10 +78,7 @@ def read_mei_camera(path: Path) -> MEI:
     def number(*keys: str) -> float:
         key = ".".join(keys)
         line, word = text(key)
-        try:
-            return _number(word, path, line)
-        except InputError:
-            raise InputError(f"{path}, line {line}: {key} is not a number: {shown(word)}. {_DOWNLOAD}") from None
+        return finite_number(word, f"{path}, line {line}: {key}", _DOWNLOAD)
 
     line, model = text("model_type")
     if model.strip("\"'") != "MEI":
@@ -161,7 +149,7 @@ def read_poses(path: Path) -> dict[int, Transform]:
     poses: dict[int, Transform] = {}
     for number, line in _lines(path):
         first, rest = (*line.split(maxsplit=1), "")[:2]
-        frame = _number(first, path, number)
+        frame = finite_number(first, f"{path}, line {number}", _DOWNLOAD)
         if frame != int(frame) or not 0 <= frame < _MAX_FRAME:
             raise InputError(f"{path}, line {number}: {shown(first)} is not a frame number. {_DOWNLOAD}")
         if int(frame) in poses:
@@ -170,27 +158,6 @@ def read_poses(path: Path) -> dict[int, Transform]:
     if not poses:
         raise InputError(f"{path}: no poses in it. {_DOWNLOAD}")
     return poses
-
-
-def read_timestamps(path: Path) -> list[float]:
-    """Read timestamps.txt: line i holds "2013-05-28 08:46:02.123456789" for frame i.
-
-    Returns:
-        Seconds since 1970, the times read as UTC; to some 0.2 µs.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: a line is not a time.
-    """
-    times = []
-    for number, line in _lines(path):
-        time = seconds_of_date(line)
-        if time is None:
-            raise InputError(
-                f"{path}, line {number}: {shown(line)} is not a time like 2013-05-28 08:46:02.123456789. {_DOWNLOAD}"
-            )
-        times.append(time)
-    return times
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -230,12 +197,8 @@ def _read_yaml(path: Path) -> tuple[dict[str, tuple[int, str]], int]:
     return values, last
 
 
-def _number(text: str, path: Path, line: int) -> float:
-    return finite_number(text, f"{path}, line {line}", _DOWNLOAD)
-
-
 def _transform(text: str, path: Path, line: int) -> Transform:
-    numbers = [_number(word, path, line) for word in text.split()]
+    numbers = [finite_number(word, f"{path}, line {line}", _DOWNLOAD) for word in text.split()]
     if len(numbers) != 12:
         raise InputError(
             f"{path}, line {line}: {len(numbers)} numbers, expected 12 (the 3×4 matrix of rotation and translation, "

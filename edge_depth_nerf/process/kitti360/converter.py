@@ -18,24 +18,23 @@ from __future__ import annotations
 
 import re
 import statistics
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.lidar import SweepTiming, check_sweep_size, read_sweep
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.process.kitti360.calibration import Kitti360Rig, read_poses, read_rig, read_timestamps
+from edge_depth_nerf.process.kitti360.calibration import read_poses, read_rig
 from edge_depth_nerf.process.options import Kitti360Options
-from edge_depth_nerf.process.poses import transform_of_rows
+from edge_depth_nerf.process.poses import read_frame_times, transform_of_rows
 from edge_depth_nerf.process.reading import load_distance, load_picture
 from edge_depth_nerf.process.recording import RecordedCamera, RecordedPicture, RecordedSweep, Recording
 from edge_depth_nerf.scene.checks import Tolerance, check_distance, check_size, require_folder
-from edge_depth_nerf.scene.writer import DistanceMap, Picture, ShiftedView, Skipped, ranges, summarise
+from edge_depth_nerf.scene.writer import DistanceMap, Picture, ShiftedView, Skipped, summarise
 
 SCANNER = "velodyne"
 """Name of the scanner."""
@@ -51,7 +50,7 @@ def read_kitti360(options: Kitti360Options) -> Recording:
         InputError: an option or a file of the drive cannot be used.
     """
     drive = Kitti360Drive(options)
-    rig = read_rig(drive.calibration, options.cameras)
+    cameras, velo_to_pose = read_rig(drive.calibration, options.cameras)
     poses = read_poses(drive.poses) if options.poses == "recorded" else None
     kept, skipped = drive.select(poses)
     tolerance = Tolerance(options.strict, len(kept))
@@ -67,22 +66,16 @@ def read_kitti360(options: Kitti360Options) -> Recording:
     kept = [(name, frame) for name, frame in kept if frame in whole]
     if not kept:
         raise InputError(f"{tolerance.left_out[0].fault} No other frame is chosen: choose more by --frames.")
-    files = {}
-    for name, frame in kept:
-        with tolerance.of(frame, name):
-            files[name, frame] = drive.check_picture(rig, kept, name, frame)
     frames = sorted({frame for _, frame in kept})
     stamps = {name: drive.read_timestamps(name, frames) for name in options.cameras}
     clock = _Clock(next((times for times in stamps.values() if times), []))
-
-    pictures = tuple(
-        picture(
-            time_s=clock.time_s(frame),
-            camera_to_world=None if poses is None else poses[frame] @ rig.camera_to_pose[name],
-            timestamp_s=stamps[name][frame] if stamps[name] else None,
-        )
-        for (name, frame), picture in files.items()
-    )
+    pictures = []
+    for name, frame in kept:
+        pose = None if poses is None else poses[frame] @ cameras[name].to_vehicle
+        stamp = stamps[name][frame] if stamps[name] else None
+        with tolerance.of(frame, name):
+            picture = drive.picture(cameras[name], frame)
+            pictures.append(picture(time_s=clock.time_s(frame), camera_to_world=pose, timestamp_s=stamp))
     timing = SweepTiming(clock.interval_s)
     sweeps = [
         RecordedSweep(
@@ -90,15 +83,15 @@ def read_kitti360(options: Kitti360Options) -> Recording:
             time_s=clock.time_s(number),
             frame=number,
             scanner=SCANNER,
-            to_vehicle=rig.velo_to_pose,
+            to_vehicle=velo_to_pose,
             read=partial(read_sweep, drive.sweep_file(number)),
             timing=timing,
         )
         for number in near(np.array(sorted(whole)), np.array(frames)).tolist()
     ]
     return Recording(
-        cameras=tuple(RecordedCamera(name, rig.cameras[name], rig.camera_to_pose[name]) for name in options.cameras),
-        pictures=pictures,
+        cameras=tuple(cameras.values()),
+        pictures=tuple(pictures),
         sweeps=tuple(sweeps),
         trajectory=None if poses is None else _trajectory(poses, clock, drive.poses),
         source={
@@ -120,7 +113,7 @@ def read_kitti360(options: Kitti360Options) -> Recording:
             for name, times in stamps.items()
             if not times
         ),
-        shifted=tuple(_shifted_views(drive, rig, set(files))),
+        shifted=tuple(_shifted_views(drive, cameras, {(picture.camera, picture.frame) for picture in pictures})),
     )
 
 
@@ -143,10 +136,8 @@ class _Clock:
 def _trajectory(poses: dict[int, np.ndarray], clock: _Clock, path: Path) -> Trajectory:
     frames = sorted(poses)
     times_s = np.array([clock.time_s(frame) for frame in frames])
-    try:
+    with found_in(str(path)):
         return Trajectory(times_s, np.stack([poses[frame] for frame in frames]))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def _near(numbers: np.ndarray, frames: np.ndarray, reach: int, between: bool) -> np.ndarray:
@@ -158,7 +149,9 @@ def _near(numbers: np.ndarray, frames: np.ndarray, reach: int, between: bool) ->
     return numbers[(apart <= reach) | (inside & between)]
 
 
-def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, taken: set[tuple[str, int]]) -> list[ShiftedView]:
+def _shifted_views(
+    drive: Kitti360Drive, cameras: dict[str, RecordedCamera], taken: set[tuple[str, int]]
+) -> list[ShiftedView]:
     """Find the true views beside the path, of the frames taken."""
     path = drive.truth / "shifted.json"
     if not path.is_file():
@@ -183,8 +176,8 @@ def _shifted_views(drive: Kitti360Drive, rig: Kitti360Rig, taken: set[tuple[str,
         camera_to_world = transform_of_rows(matrix, where)
         folder = drive.truth / name / f"shifted_{metres}m"
         picture, distance = (folder / kind / f"{frame:010d}.png" for kind in ("rgb", "distance"))
-        check_size(picture, rig.cameras[name])
-        check_distance(distance, rig.cameras[name])
+        check_size(picture, cameras[name].camera)
+        check_distance(distance, cameras[name].camera)
         views.append(
             ShiftedView(
                 metres=float(metres),
@@ -207,11 +200,10 @@ class Kitti360Drive:
 
     Raises:
         FileNotFoundError: a folder is missing.
-        InputError: an option is out of its range.
+        InputError: other cameras than the fisheyes are asked for.
     """
 
     def __init__(self, options: Kitti360Options) -> None:
-        options.check()
         names = options.cameras
         if not (len(set(names)) == len(names) > 0 and set(names) <= {"image_02", "image_03"}):
             raise InputError(f"--cameras {' '.join(names)}: expected image_02, image_03 or both.")
@@ -288,29 +280,19 @@ class Kitti360Drive:
         """The sweep of a frame."""
         return self.sweeps / f"{frame:010d}.bin"
 
-    def check_picture(
-        self, rig: Kitti360Rig, kept: Sequence[tuple[str, int]], name: str, frame: int
-    ) -> partial[RecordedPicture]:
+    def picture(self, recorded: RecordedCamera, frame: int) -> partial[RecordedPicture]:
         """Find a picture and what its maps are made from, and check sizes and headers; time and pose are not set.
 
         Raises:
             FileNotFoundError: a mask, monocular or true map is missing.
             InputError: a file is truncated, or not of its camera's size or kind.
         """
-        options, camera, file = self.options, rig.cameras[name], f"{frame:010d}.png"
-        mask = None if options.frame_masks is None else options.frame_masks / name / file
-        mono = None if options.mono is None else options.mono / name / file
+        name, camera, file = recorded.name, recorded.camera, f"{frame:010d}.png"
         truth_distance, truth_rgb = (
             self.truth / name / kind / file if self.has_truth else None for kind in ("distance", "rgb")
         )
         check_size(self.image_folder(name) / file, camera)
-        for option, path in (("--mono", mono), ("--frame-masks", mask)):
-            if path is not None and not path.is_file():
-                frames = ranges([number for other, number in kept if other == name])
-                raise FileNotFoundError(
-                    f"{path}: no such file; {option} needs one for every frame taken ({frames} of {name}). Make "
-                    f"the missing ones, choose other frames, or leave out {option}."
-                )
+        mono, mask = self.options.map_of(name, frame, "mono"), self.options.map_of(name, frame, "frame_masks")
         for path in (truth_distance, truth_rgb):
             if path is not None and not path.is_file():
                 raise FileNotFoundError(
@@ -343,13 +325,7 @@ class Kitti360Drive:
         path = self.timestamps_file(camera)
         if not path.is_file():
             return []
-        times = read_timestamps(path)
-        for number, (before, time) in enumerate(pairwise(times), 2):
-            if not time > before:
-                raise InputError(
-                    f"{path}, line {number}: not after the line before. Copy the file again from the data set, or move "
-                    "it away: frames then count as 0.1 s apart."
-                )
+        times = read_frame_times(path, ", or move it away: frames then count as 0.1 s apart")
         if missing := [frame for frame in frames if frame >= len(times)]:
             raise InputError(
                 f"{path}: ends after line {len(times)}, but frame {missing[0]} needs line {missing[0] + 1}. The file "
