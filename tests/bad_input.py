@@ -36,7 +36,6 @@ from edge_depth_nerf.compare.command import read_tuned
 from edge_depth_nerf.compare.results import check_fair, read_results
 from edge_depth_nerf.compare.specification import RunSpecification
 from edge_depth_nerf.lidar.scans import ScanFormat, check_scan, read_cloud, read_scan
-from edge_depth_nerf.lidar.sweeps import read_sweep
 from edge_depth_nerf.method.error_model import read_calibration
 from edge_depth_nerf.mono.files import read_npy as read_map
 from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, load_network, save_network
@@ -250,7 +249,6 @@ OURS: dict[str, Reader] = {
 READERS: dict[str, Reader] = {
     **OURS,
     "recording": Reader(recording, read_recording),
-    "sweep": Reader(named("a.bin", points().tobytes()), read_sweep, "binary"),
     "scan bin": Reader(named("a.bin", points().tobytes()), lambda path: scan(path), "binary"),
     "scan npy": Reader(named("a.npy", npy(points())), lambda path: scan(path), "npy"),
     "scan npz": Reader(named("a.npz", npz(data=points())), lambda path: scan(path), "binary"),
