@@ -53,10 +53,6 @@ class FreeSpace:
         free_to_m = _least_around(shortest.reshape(rows, columns))
         return FreeSpace(world_to_scanner, lowest, cell_rad, torch.from_numpy(free_to_m))
 
-    def seen_through(self, points_in_world: Float[Tensor, "points 3"]) -> Bool[Tensor, "points"]:
-        """Whether beams passed each point and ended beyond it."""
-        return self.observed(points_in_world)[0]
-
     def observed(
         self, points_in_world: Float[Tensor, "points 3"]
     ) -> tuple[Bool[Tensor, "points"], Bool[Tensor, "points"]]:
