@@ -67,7 +67,7 @@ from edge_depth_nerf.method.prior import (
     motion_sigma,
     ray_angles,
 )
-from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
+from edge_depth_nerf.mono.far_seen import ELEVATION_QUANTILES, seen_above, static_cloud
 from edge_depth_nerf.mono.motion_seen import left_out_pixels
 from edge_depth_nerf.scene.format import CALIBRATION_FILE
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
@@ -82,8 +82,6 @@ HELD_OUT_PART = 0.1
 """So much of the blocks, and of the single LiDAR points, is held out."""
 HELD_OUT_ROWS = (0.1, 0.95)
 """In every second frame LiDAR points below and above these quantiles of their elevation are held out."""
-FIELD_QUANTILES = (0.001, 0.999)
-"""LiDAR's field of elevation, except for stray points."""
 _BEYOND_VERSION = 2
 """Part of the key of calibrations with motion: raised when they measure otherwise beyond LiDAR's field."""
 REACH_QUANTILE = 0.95
@@ -399,7 +397,7 @@ def _within(field_rad: tuple[float, float], view: RayAngles) -> NDArray[np.bool_
 def _field_rad(elevations_rad: Sequence[NDArray[np.float32]]) -> tuple[float, float]:
     """LiDAR's field by the elevations of all LiDAR points."""
     every = np.concatenate(elevations_rad)
-    low, high = np.quantile(every, FIELD_QUANTILES) if len(every) else (0.0, 0.0)
+    low, high = np.quantile(every, ELEVATION_QUANTILES) if len(every) else (0.0, 0.0)
     return float(low), float(high)
 
 
@@ -466,7 +464,7 @@ def measure_frame(
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.lidar_points, view.theta_rad)
     measured_m, measured = lidar_m, left_out
     if far_seen_m is not None and lidar_points.any():
-        highest = np.quantile(view.elevation_rad[lidar_points], FIELD_QUANTILES[1]) + np.radians(FIELD_MARGIN_DEG)
+        highest = np.quantile(view.elevation_rad[lidar_points], ELEVATION_QUANTILES[1]) + np.radians(FIELD_MARGIN_DEG)
         far_seen = usable & (far_seen_m > 0) & ~lidar_points & (view.elevation_rad <= highest)
         measured_m, measured = np.where(far_seen, far_seen_m, lidar_m), left_out | far_seen
     evaluated = _some(measured & (frame.distance_m > 0), _EVALUATED_A_FRAME, rng)

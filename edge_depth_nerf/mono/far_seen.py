@@ -141,9 +141,9 @@ def seen_above(
     field = _field(scene, picture)
     near = cloud.part(cloud.near(picture))
     high = near.part(_is_above(picture, near.points_m, field.top_sine))
-    in_camera, spacing_m = torch.from_numpy(_to_camera(picture, high.points_m)), torch.from_numpy(high.spacing_m)
+    in_camera = torch.from_numpy((high.points_m - picture.position_m) @ picture.pose[:3, :3])
     lens = scaled_lens(picture.lens, size)
-    projected = project_points(in_camera, lens, spacing_m=spacing_m)
+    projected = project_points(in_camera, lens, spacing_m=torch.from_numpy(high.spacing_m))
     distance_m = projected.distance_m.float().numpy()
     found = rays(lens, scene.theta_max_rad)
     sine = found.directions @ picture.up_in_camera.astype(np.float32)
@@ -198,7 +198,7 @@ def _level_m(distance_m: NDArray[np.float32], sine: NDArray[np.float32]) -> NDAr
 
 def _azimuth(picture: ScenePicture, rays: Float32[np.ndarray, "*shape 3"]) -> NDArray[np.intp]:
     """Which of the azimuths rays in the camera's frame have in the world."""
-    world = (rays * np.array([1.0, -1.0, -1.0])) @ picture.rotation.T
+    world = rays @ picture.pose[:3, :3].T
     turn = np.arctan2(world[..., 1], world[..., 0]) / (2 * np.pi) + 0.5
     return (turn * _AZIMUTHS).astype(np.intp) % _AZIMUTHS
 
@@ -241,15 +241,11 @@ def _own(scene: SceneFolder, picture: ScenePicture) -> tuple[Float32[np.ndarray,
     return scene.rays(picture).directions, lidar_m
 
 
-def _to_camera(picture: ScenePicture, points_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    return (points_m - picture.position_m) @ picture.rotation * np.array([1.0, -1.0, -1.0])
-
-
 def _votes(
     picture: ScenePicture, points_m: Float64[np.ndarray, "n 3"], lidar_m: Float32[np.ndarray, "h w"]
 ) -> Int32[np.ndarray, "n"]:
     """1 for each point that the picture's own LiDAR points confirm, -1 for each that they saw through, else 0."""
-    in_camera = torch.from_numpy(_to_camera(picture, points_m))
+    in_camera = torch.from_numpy((points_m - picture.position_m) @ picture.pose[:3, :3])
     pixels, valid = picture.lens.project(in_camera)
     seen = (valid & picture.lens.inside(pixels)).numpy()
     column, row = pixels[torch.from_numpy(seen)].long().unbind(-1)
