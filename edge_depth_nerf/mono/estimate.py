@@ -229,15 +229,15 @@ def _write_predicted(network: ReadyNetwork, scenes: Sequence[SceneFolder], conso
 
 def _write_from_files(options: EstimateDepthOptions, scene: SceneFolder, console: Console) -> None:
     assert options.maps is not None and options.maps_kind is not None and options.maps_along is not None
-    files = find_maps(scene, options.maps, options.maps_kind, options.maps_along, options.metres_per_count)
+    layers = find_maps(scene, options.maps, options.maps_kind, options.maps_along, options.metres_per_count)
     source = {
         "kind": "files",
         "trained_on": options.maps_trained_on or "elsewhere",
         "folder": options.maps.resolve().name,
-        "output": files.kind,
-        "along": files.along,
+        "output": options.maps_kind,
+        "along": options.maps_along,
     }
-    _write_fitted([FittedMaps(scene, files.kind, lambda picture: [files.layer(scene, picture)])], source, console)
+    _write_fitted([FittedMaps(scene, options.maps_kind, layers)], source, console)
 
 
 def _write_fitted(every: Sequence[FittedMaps], source: dict[str, Any], console: Console) -> None:
