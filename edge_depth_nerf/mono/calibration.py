@@ -330,7 +330,7 @@ def _calibrate(
         )
 
     with_motion = _with_motion(scene, depth_source, options)
-    errors: MotionErrors | None = None
+    errors: tuple[float, float] | None = None
     field_rad = (0.0, 0.0)
 
     def measure(numbered: tuple[int, ScenePicture]) -> MeasuredFrame:
@@ -342,7 +342,7 @@ def _calibrate(
         if errors is not None and motion_m is not None:
             around_m = around_or_nothing(motion_m, maps.distances_m.get("motion_around"))
             beyond = ~_within(field_rad, view)
-            motion = MotionMap(motion_m, errors.weight, np.ones_like(maps.usable), beyond, around_m)
+            motion = MotionMap(motion_m, weight_of_errors(*errors), np.ones_like(maps.usable), beyond, around_m)
         far_seen_m = seen_above(cloud, scene, picture, (picture.lens.width, picture.lens.height))
         measured = measure_frame(
             *(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m, depth_source),
@@ -374,19 +374,6 @@ def _calibrate(
         frames = list(counted(measure))
     made_of = _made_of(scene, pictures, depth_source, options)
     return combine(frames, options, made_of, maps_trained_on(scene.meta) == "elsewhere", depth_source, errors)
-
-
-@dataclasses.dataclass(frozen=True)
-class MotionErrors:
-    """Relative errors of two sources where both have a distance: half of what 95 % are within."""
-
-    motion: float
-    mono: float
-
-    @property
-    def weight(self) -> float:
-        """Motion's part of their mean."""
-        return weight_of_errors(self.motion, self.mono)
 
 
 def _within(field_rad: tuple[float, float], view: RayAngles) -> NDArray[np.bool_]:
@@ -422,13 +409,16 @@ def _errors_of_both(
     return errors, elevation_rad[maps.usable & (maps.lidar_m > 0)]  # pyrefly: ignore[bad-return]
 
 
-def _motion_errors(of_frames: Sequence[NDArray[np.float32]]) -> MotionErrors | None:
-    """Errors of both sources over all frames; None where too little was evaluated."""
+def _motion_errors(of_frames: Sequence[NDArray[np.float32]]) -> tuple[float, float] | None:
+    """Relative errors of motion and of the monocular maps over all frames: half of what 95 % are within.
+
+    None where too little was evaluated.
+    """
     found = np.concatenate(of_frames, 1)
     if found.shape[1] < LEAST_EVALUATED:
         return None
     motion, mono = np.quantile(found, 0.95, axis=1) / 2
-    return MotionErrors(float(motion), float(mono))
+    return float(motion), float(mono)
 
 
 def measure_frame(
@@ -556,12 +546,13 @@ def combine(
     made_of: str,
     everywhere: bool,
     depth_source: str = INTEGRATED,
-    motion_errors: MotionErrors | None = None,
+    motion_errors: tuple[float, float] | None = None,
 ) -> Calibration:
     """Put the measurements of a drive's frames, at least one, together.
 
     The key `made_of` is kept in the result; `everywhere` says whether the monocular maps are to be trusted beyond
-    LiDAR's field of elevation, and `motion_errors` by which errors motion took part in the frames' priors.
+    LiDAR's field of elevation, and `motion_errors` by which errors of motion and of these maps motion took part in the
+    frames' priors.
     """
     lidar_m, mono_m = (np.concatenate([getattr(frame, name) for frame in frames]) for name in ("lidar_m", "mono_m"))
     aligned = options.align != "none" and depth_source == INTEGRATED
@@ -576,7 +567,7 @@ def combine(
             errors = errors.where(~from_motion)
         if model is not None:
             beyond = _combine_beyond([frame.beyond for frame in frames if frame.beyond is not None])
-            motion = MotionCalibration(motion_errors.weight, motion_errors.motion, motion_errors.mono, model, beyond)
+            motion = MotionCalibration(weight_of_errors(*motion_errors), *motion_errors, model, beyond)
     return Calibration(
         made_of=made_of,
         error_model=errors.model(),
