@@ -262,7 +262,7 @@ def _bin_header(path: Path, size: int, scan: ScanFormat) -> _Header:
     if size % record.itemsize:
         raise InputError(
             f"{path}: {size} bytes, expected a multiple of {record.itemsize} ({', '.join(scan.columns)} as "
-            f"{scan.dtype}). The file is truncated, or has other columns than the rig file names. {_AGAIN}"
+            f"{scan.dtype}). The file is truncated, or has other columns (a rig file states them). {_AGAIN}"
         )
     return _Header(record, size // record.itemsize, "records")
 
