@@ -36,9 +36,8 @@ from edge_depth_nerf.compare.command import read_tuned
 from edge_depth_nerf.compare.results import check_fair, read_results
 from edge_depth_nerf.compare.specification import RunSpecification
 from edge_depth_nerf.lidar.scans import ScanFormat, check_scan, read_cloud, read_scan
-from edge_depth_nerf.lidar.sweeps import read_sweep
 from edge_depth_nerf.method.error_model import read_calibration
-from edge_depth_nerf.mono.files import read_npy as read_map
+from edge_depth_nerf.mono.files import read_maps
 from edge_depth_nerf.mono.network import DepthNetwork, NetworkSettings, load_network, save_network
 from edge_depth_nerf.process.kitti360.calibration import (
     read_cam_to_pose,
@@ -249,7 +248,6 @@ OURS: dict[str, Reader] = {
 READERS: dict[str, Reader] = {
     **OURS,
     "recording": Reader(recording, read_recording),
-    "sweep": Reader(named("a.bin", points().tobytes()), read_sweep, "binary"),
     "scan bin": Reader(named("a.bin", points().tobytes()), lambda path: scan(path), "binary"),
     "scan npy": Reader(named("a.npy", npy(points())), lambda path: scan(path), "npy"),
     "scan npz": Reader(named("a.npz", npz(data=points())), lambda path: scan(path), "binary"),
@@ -268,7 +266,7 @@ READERS: dict[str, Reader] = {
     "picture copied": Reader(picture(write_png, np.zeros((12, 16, 3), np.uint8)), read_png_bytes, "png"),
     "mask": Reader(picture(write_mask, np.ones((12, 16), bool)), read_mask, "png"),
     "distance": Reader(picture(write_distance_png, np.full((12, 16), 9.0)), read_distance_png, "png"),
-    "map npy": Reader(named("a.npy", npy(np.ones((12, 16), np.float32))), read_map, "npy"),
+    "map npy": Reader(named("a.npy", npy(np.ones((12, 16), np.float32))), lambda path: read_maps([path], 1.0), "npy"),
     "array npy": Reader(named("a.npy", npy(np.ones((12, 16), np.uint16))), read_npy, "npy"),
     "arrays npz": Reader(
         named("a.npz", npz(distance_m=np.ones((12, 16), np.float32))),

@@ -137,7 +137,7 @@ def test_a_pose_that_is_off_is_named(sample_drive, tmp_path):
 
 
 def agreements(medians_px: Sequence[float]) -> list[EpipolarAgreement]:
-    return [EpipolarAgreement("left", n, n + 1, 100, median_px, 0.9) for n, median_px in enumerate(medians_px)]
+    return [EpipolarAgreement("left", n, n + 1, median_px) for n, median_px in enumerate(medians_px)]
 
 
 @pytest.mark.parametrize(

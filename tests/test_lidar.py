@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from edge_depth_nerf.cameras import MEI, Pinhole
-from edge_depth_nerf.lidar import project_points, read_sweep, transform_points
+from edge_depth_nerf.lidar import project_points, transform_points
+from edge_depth_nerf.lidar.scans import ScanFormat, read_scan
 
 FISHEYE = MEI(70, 70, 66.8, 66.8, 35.9, 35.3, 2.2134, 0.0168, 1.6549, 4e-4, 4e-4)
 PINHOLE = Pinhole(20, 10, 10.0, 10.0, 10.0, 5.0)
@@ -20,7 +21,7 @@ def write(path: Path, rows: list[list[float]]) -> Path:
 
 
 def test_reads_points_and_reflectance_in_order(tmp_path: Path) -> None:
-    sweep = read_sweep(write(tmp_path / "a.bin", [[1, 2, 3, 0.25], [-4, 5, -6, 1.0]]))
+    sweep = read_scan(write(tmp_path / "a.bin", [[1, 2, 3, 0.25], [-4, 5, -6, 1.0]]), ScanFormat())
     assert sweep.points_m.dtype == torch.float64
     assert sweep.points_m.tolist() == [[1, 2, 3], [-4, 5, -6]]
     assert sweep.reflectance.tolist() == [0.25, 1.0]
@@ -29,11 +30,11 @@ def test_reads_points_and_reflectance_in_order(tmp_path: Path) -> None:
 
 def test_leaves_out_and_counts_what_is_no_point(tmp_path: Path) -> None:
     rows = [[1, 0, 0], [math.nan, 0, 0], [0, -math.inf, 0], [0, 0, 0], [0.2, 0.2, 0.2], [300, 0, 0], [0, 0, 9]]
-    sweep = read_sweep(write(tmp_path / "a.bin", [[*row, 0] for row in rows]))
+    sweep = read_scan(write(tmp_path / "a.bin", [[*row, 0] for row in rows]), ScanFormat())
     assert sweep.points_m.tolist() == [[1, 0, 0], [0, 0, 9]]
     assert (sweep.not_finite, sweep.out_of_range) == (2, 3)
     with pytest.raises(FileNotFoundError, match=r"b\.bin"):
-        read_sweep(tmp_path / "b.bin")
+        read_scan(tmp_path / "b.bin", ScanFormat())
 
 
 def test_transform_points() -> None:

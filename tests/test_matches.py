@@ -23,7 +23,6 @@ from edge_depth_nerf.poses.matches import (
     match_features,
     match_pictures,
     sights_of,
-    successive,
 )
 
 PINHOLE = Pinhole(640, 480, 400.0, 405.0, 318.0, 243.0, -0.05, 0.01, 1e-3, -5e-4)
@@ -128,19 +127,16 @@ def pictures(poses: list[np.ndarray], lens: Camera = PINHOLE) -> list[PosedPictu
 def test_along_a_drive_right_poses_are_told_from_wrong_ones() -> None:
     poses = [pose((0, 1.5 * n, 0), (0.4 * n, 0, 0)) for n in range(3)]
     right = along_drive(pictures(poses))
-    assert [(a.camera, a.first, a.second) for a in right] == [("front", 10, 11), ("front", 10, 12), ("front", 11, 12)]
+    assert [(a.camera, a.first, a.second) for a in right] == [("front", 10, 11), ("front", 11, 12)]
     for found in right:
-        assert found.matches > 100
         assert found.median_px < 0.2
-        assert found.inliers > 0.9
     wrong = [*poses[:2], poses[2] @ pose((0.5, 0, 0), (0, 0, 0))]
     given = pictures(poses)
     placed = [PosedPicture(p.camera, p.frame, p.lens, at, p.read_rgb) for p, at in zip(given, wrong, strict=True)]
-    first, *others = along_drive(placed)
+    first, second = along_drive(placed)
     assert first.median_px < 0.2
-    for found in others:
-        # half a degree is 3.5 px here, most of it across the curves
-        assert found.median_px > 1.5
+    # half a degree is 3.5 px here, most of it across the curves
+    assert second.median_px > 1.5
 
 
 @pytest.mark.slow
@@ -170,10 +166,9 @@ def test_nothing_to_see_gives_nothing() -> None:
     black = np.zeros((480, 640, 3), np.uint8)
     given = [PosedPicture("a", n, PINHOLE, pose((0, 0, 0), (n, 0, 0)), lambda: black) for n in range(3)]
     found = along_drive(given)
-    assert [a.matches for a in found] == [0, 0, 0]
-    assert all(math.isnan(a.median_px) for a in found)
+    assert len(found) == 2 and all(math.isnan(a.median_px) for a in found)
     standing = [PosedPicture("a", n, PINHOLE, pose((0, 0, 0), (0, 0, 0)), lambda: black) for n in range(3)]
-    assert successive(standing) == []
+    assert along_drive(standing) == []
 
 
 def test_matches_are_mutual_and_clear() -> None:

@@ -329,7 +329,7 @@ def test_the_command_writes_maps_of_a_ready_made_network(networks, name, tmp_pat
     monkeypatch.setattr(sys, "argv", command)
     main()
     said = capsys.readouterr().out
-    assert "depth in metres" in said if name == "anything-metric" else "disparity" in said
+    assert ("metric maps" if name == "anything-metric" else "inverse maps, fitted to LiDAR") in said
     meta = read_json(folder / "transforms.json")
     assert meta["mono"]["trained_on"] == "elsewhere" and meta["mono"]["network"] == name
     assert str(tmp_path) not in str(meta["mono"])

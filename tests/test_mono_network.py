@@ -38,7 +38,7 @@ from edge_depth_nerf.mono.estimate import (
     predicted_maps,
     training_split,
 )
-from edge_depth_nerf.mono.examples import Examples, load_examples, network_view, small_lidar
+from edge_depth_nerf.mono.examples import Examples, load_examples, network_view, reduced
 from edge_depth_nerf.mono.network import (
     ARCHITECTURE,
     DepthNetwork,
@@ -259,8 +259,8 @@ def test_the_presets_cut_what_is_said(preset, sides_px):
 def test_of_several_points_in_a_pixel_the_one_nearest_its_centre_is_learned(small_street):
     scene = read_scene(small_street)
     picture = scene.pictures[0]
-    view = network_view(scene, picture, 12)
-    rows, columns = view.usable.shape
+    _, usable = network_view(scene, picture, 12)
+    rows, columns = usable.shape
     lidar = read_distance_png(picture.files["lidar"])
     expected = np.zeros((rows, columns), np.float32)
     nearest = np.full((rows, columns), np.inf)
@@ -269,10 +269,10 @@ def test_of_several_points_in_a_pixel_the_one_nearest_its_centre_is_learned(smal
         off = np.hypot(y - int(y) - 0.5, x - int(x) - 0.5)
         if off < nearest[int(y), int(x)] - 1e-9:
             nearest[int(y), int(x)], expected[int(y), int(x)] = off, lidar[row, column]
-    found = small_lidar(scene, picture, view)
-    assert ((found > 0) == ((expected > 0) & view.usable)).all() and (found > 0).sum() > 20
+    found = reduced(scene.lidar_m(picture), usable)
+    assert ((found > 0) == ((expected > 0) & usable)).all() and (found > 0).sum() > 20
     # equally near ones may be taken either way
-    assert (found == np.where(view.usable, expected, 0)).mean() > 0.9
+    assert (found == np.where(usable, expected, 0)).mean() > 0.9
 
 
 def test_the_camera_height_is_that_above_the_floor(small_street):
@@ -416,25 +416,26 @@ def test_held_out_pictures_have_no_say_and_the_command_continues(small_street, t
     held_out = "0004.png"
     write_png(other / "images" / held_out, np.full((LENS.height, LENS.width, 3), 200, np.uint8))
     write_distance_png(other / "lidar" / held_out, np.full((LENS.height, LENS.width), 33.0))
-    reports = [estimate_depth(EstimateDepthOptions((scene,), train_steps=3), QUIET) for scene in (small_street, other)]
-    weights = [load_file(report.weights) for report in reports]
+    done = [estimate_depth(EstimateDepthOptions((scene,), train_steps=3), QUIET) for scene in (small_street, other)]
+    weights = [load_file(path) for path, _ in done]
     assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0])
-    assert reports[0].trained is not None and reports[0].trained.steps == 3 and reports[0].predicted == 10
+    assert done[0][1] is not None and done[0][1].steps == 3
     assert not list(small_street.glob("*.checkpoint"))
     entry = read_json(small_street / "transforms.json")["mono"]
     # frame 4 is held out, frame 5 kept for stopping
     assert entry["trained_frames"] == [f"images/{number:04d}.png" for number in (0, 1, 2, 3, 6, 7, 8, 9)]
 
     # what is trained is not trained again, until something is asked for differently
-    assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=3), QUIET).trained is None
-    assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=4), QUIET).trained is not None
+    assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=3), QUIET)[1] is None
+    assert estimate_depth(EstimateDepthOptions((small_street,), train_steps=4), QUIET)[1] is not None
 
 
 def test_a_network_whose_time_was_up_early_is_told_of(small_street, capsys):
-    report = estimate_depth(EstimateDepthOptions((small_street,), train_steps=100_000, seconds=0.3), Console(width=200))
-    assert report.trained is not None and report.trained.steps < 200
+    options = EstimateDepthOptions((small_street,), train_steps=100_000, seconds=0.3)
+    _, trained = estimate_depth(options, Console(width=200))
+    assert trained is not None and trained.steps < 200
     said = capsys.readouterr().out
-    assert f"Trained {report.trained.steps} steps of 100,000, where the time limit was reached, in " in said
+    assert f"Trained {trained.steps} steps of 100,000, where the time limit was reached, in " in said
     assert "make poor maps: increase --seconds" in said
 
 
@@ -487,9 +488,9 @@ def test_a_map_has_the_size_of_its_picture_and_begins_as_the_room(small_street):
 def test_training_goes_on_from_given_weights(small_street, tmp_path):
     settings, start = dataclasses.replace(TINY, camera_height_m=1.0), tmp_path / "start.safetensors"
     save_network(start, DepthNetwork(settings), {})
-    report = estimate_depth(EstimateDepthOptions((small_street,), model=start, train_steps=2), QUIET)
-    network, _ = load_network(report.weights)
-    assert report.weights == small_street / WEIGHTS and network.settings == settings
+    weights, _ = estimate_depth(EstimateDepthOptions((small_street,), model=start, train_steps=2), QUIET)
+    network, _ = load_network(weights)
+    assert weights == small_street / WEIGHTS and network.settings == settings
     assert float(network.head.weight.detach().abs().max()) > 0
 
 
@@ -535,8 +536,8 @@ def test_training_never_writes_over_the_weights_it_starts_from(small_street, tmp
             estimate_depth(EstimateDepthOptions((small_street,), model=model, train_steps=1), QUIET)
     assert path.read_bytes() == before
     other = EstimateDepthOptions((small_street,), model=path, train_steps=1, output=tmp_path / "on.safetensors")
-    assert estimate_depth(other, QUIET).trained is not None
-    assert estimate_depth(other, QUIET).trained is None
+    assert estimate_depth(other, QUIET)[1] is not None
+    assert estimate_depth(other, QUIET)[1] is None
     assert path.read_bytes() == before
 
 
@@ -555,9 +556,9 @@ def test_scenes_of_one_name_keep_their_own_trained_frames(tmp_path):
     one = write_street(tmp_path / "a" / "scene", frames=10, seed=1)
     other = write_street(tmp_path / "b" / "scene", frames=4, seed=2)
     unseen = write_street(tmp_path / "c" / "scene", frames=3, seed=3)
-    report = estimate_depth(EstimateDepthOptions((one, other), train_steps=1), QUIET)
+    weights, _ = estimate_depth(EstimateDepthOptions((one, other), train_steps=1), QUIET)
     moved = other.rename(tmp_path / "elsewhere")
-    estimate_depth(EstimateDepthOptions((unseen, moved), model=report.weights), QUIET)
+    estimate_depth(EstimateDepthOptions((unseen, moved), model=weights), QUIET)
 
     def frames(scene: Path) -> list[str]:
         return [str(Path(name).stem) for name in read_json(scene / "transforms.json")["mono"]["trained_frames"]]
@@ -590,12 +591,12 @@ def test_the_field_of_the_training_points_goes_with_weights_and_maps(tmp_path):
         expected.append(np.quantile(np.concatenate(up), [0.001, 0.999]))
     expected = [min(e[0] for e in expected), max(e[1] for e in expected)]
     assert expected[0] < -30 and expected[1] > 30
-    report = estimate_depth(EstimateDepthOptions((low, high), train_steps=1), QUIET)
+    weights, _ = estimate_depth(EstimateDepthOptions((low, high), train_steps=1), QUIET)
     # pixels are degrees apart
-    found = load_network(report.weights)[1]["field_deg"]
+    found = load_network(weights)[1]["field_deg"]
     assert found == pytest.approx(expected, abs=0.5)
     target = write_street(tmp_path / "target", frames=2, seed=5, lidar=False)
-    estimate_depth(EstimateDepthOptions((target,), model=report.weights), QUIET)
+    estimate_depth(EstimateDepthOptions((target,), model=weights), QUIET)
     assert read_json(target / "transforms.json")["mono"]["field_deg"] == found
 
     # weights of before have none

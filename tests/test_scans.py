@@ -186,7 +186,7 @@ def test_an_archive_says_what_it_lacks(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=message):
             check_scan(path, wrong)
     path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(InputError, match=r"a\.npz: cannot be read as arrays"):
+    with pytest.raises(InputError, match=r"a\.npz: cannot be read as \.npz"):
         check_scan(path, scan)
     damaged, _ = write_npz(tmp_path)
     content = bytearray(damaged.read_bytes())
@@ -212,7 +212,7 @@ def test_broken_tables_are_named(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for spoilt in (whole[: len(whole) // 2], b"ARROW1" + bytes(200), bytes(50)):
         path.write_bytes(spoilt)
-        with pytest.raises(InputError, match=r"a\.feather: cannot be read as a table"):
+        with pytest.raises(InputError, match=r"a\.feather: cannot be read as \.feather"):
             check_scan(path, scan)
     path.write_bytes(whole)
     with pytest.raises(InputError, match=r"a\.feather: has no column X"):
@@ -283,7 +283,7 @@ BROKEN = {
     "all NaN": (lambda f: saved(f / "a.npy", np.full((4, 4), np.nan)), r"a\.npy: none of its 4 points.*4 are NaN"),
     "no points": (lambda f: saved(f / "a.npy", np.zeros((0, 4))), r"a\.npy: a scan without points"),
     "other columns": (lambda f: saved(f / "a.npy", np.zeros((9, 5))), r"shape \(9, 5\).*points × 4"),
-    "pickled": (lambda f: saved(f / "a.npy", np.array([{}, None])), r"a\.npy: cannot be read as an array"),
+    "pickled": (lambda f: saved(f / "a.npy", np.array([{}, None])), r"a\.npy: cannot be read as"),
     "no column": (lambda f: saved(f / "a.npy", records()[["x", "y", "t"]]), r"has no column z, only x, y, t"),
     "cut .npy": (
         lambda f: named(f, "b.npy", saved(f / "a.npy", np.ones((9, 4))).read_bytes()[:-8]),

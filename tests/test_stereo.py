@@ -26,8 +26,8 @@ from edge_depth_nerf.stereo.sweep import (
     NEAREST_M,
     STEP_PX,
     STEP_SHARE,
-    Geometry,
     Swept,
+    geometry_of,
     hypotheses,
     rays_of,
     sweep_view,
@@ -133,13 +133,11 @@ def test_series_projects_as_the_lens_does(camera, theta_max_deg):
     seen = rays(camera, theta_max_rad)
     series = projection_series(camera, theta_max_rad)
     at, within = seen.directions[seen.within].T.copy(), int(seen.within.sum())
-    column, row, length = (np.empty(within, np.float32) for _ in range(3))
+    work = np.empty((8, within), np.float32)
     turn, shift = np.eye(3, dtype=np.float32), np.array([0.1, -0.2, 0.05], np.float32)
     nearness = np.full(within, 0.5, np.float32)
-    sphere_sweep._project_row(
-        *(at, nearness, turn, shift, series.factors, series.numbers, np.empty((5, within), np.float32)),
-        *(column, row, length),
-    )
+    sphere_sweep._project_row(at, nearness, turn, shift, series.factors, series.numbers, work)
+    column, row, length = work[5:]
     points = at.T.astype(np.float64) + 0.5 * shift
     expected, valid = camera.project(torch.from_numpy(points))
     reached = (column != -1) & valid.numpy()
@@ -152,13 +150,10 @@ def test_series_projects_as_the_lens_does(camera, theta_max_deg):
 def test_beyond_the_lens_nothing_is_projected():
     series = projection_series(FISHEYE, THETA_MAX_RAD)
     at = np.array([[math.sin(2.2), 0.0, math.cos(2.2)], [0.0, 0.0, 1.0]], np.float32).T.copy()
-    column, row, length = (np.empty(2, np.float32) for _ in range(3))
-    sphere_sweep._project_row(
-        *(at, np.zeros(2, np.float32), np.eye(3, dtype=np.float32), np.zeros(3, np.float32)),
-        *(series.factors, series.numbers, np.empty((5, 2), np.float32), column, row, length),
-    )
-    assert column[0] == -1
-    assert column[1] == pytest.approx(FISHEYE.cx - 0.5, abs=1e-3)
+    turn, shift, work = np.eye(3, dtype=np.float32), np.zeros(3, np.float32), np.empty((8, 2), np.float32)
+    sphere_sweep._project_row(at, np.zeros(2, np.float32), turn, shift, series.factors, series.numbers, work)
+    assert work[5, 0] == -1
+    assert work[5, 1] == pytest.approx(FISHEYE.cx - 0.5, abs=1e-3)
 
 
 # ---- the loops against slow twins ------------------------------------------------------------------------------
@@ -201,11 +196,9 @@ def test_sweep_is_its_slow_twin():
     view.grey[10:13, 4:6] = np.nan
     used = view.used
     spans = np.stack([used.argmax(1), np.where(used.any(1), 30 - used[:, ::-1].argmax(1), 0)], -1)
-    geometry, inverses = Geometry.of(view, neighbours), np.array([0.0, 0.15, 0.4], np.float32)
+    (pictures, transforms), inverses = geometry_of(view, neighbours), np.array([0.0, 0.15, 0.4], np.float32)
     cost = np.empty((28, 3, 30), np.float32)
-    sphere_sweep.sweep(
-        *(view.grey, geometry.pictures, rays_of(view), spans, *geometry.transforms, inverses, np.float32(2.0), cost)
-    )
+    sphere_sweep.sweep(*(view.grey, pictures, rays_of(view), spans, *transforms, inverses, np.float32(2.0), cost))
     expected = np.stack([slow_cost(view, neighbours, float(each), 2.0) for each in inverses], 1)
     assert (expected < 1).mean() > 0.3
     # at the rim of a lens a rounding decides who sees a pixel

@@ -163,11 +163,11 @@ def test_sees_through_what_is_gone_and_not_through_what_is_there() -> None:
     free = FreeSpace.of(sweep)
     rng = np.random.default_rng(0)
     rays = circle(1.0)[rng.integers(0, 72000, 1000)]
-    at = {range_m: free.seen_through(torch.from_numpy(rays * range_m)).float().mean() for range_m in (5, 18, 20, 25)}
+    at = {range_m: free.observed(torch.from_numpy(rays * range_m))[0].float().mean() for range_m in (5, 18, 20, 25)}
     assert at[5] > 0.99 and at[18] > 0.99
     assert at[20] == 0 and at[25] == 0
     # above and below the field nothing is known
-    assert not free.seen_through(torch.tensor([[5.0, 0, 3.0], [5.0, 0, -4.0]], dtype=torch.float64)).any()
+    assert not free.observed(torch.tensor([[5.0, 0, 3.0], [5.0, 0, -4.0]], dtype=torch.float64))[0].any()
 
 
 def test_the_edge_of_a_thing_is_not_seen_through() -> None:
@@ -177,7 +177,7 @@ def test_the_edge_of_a_thing_is_not_seen_through() -> None:
     points[pole] *= 0.5
     free = FreeSpace.of(sweep_in_world(as_sweep(points), 0.0, np.eye(4), straight(0.0), None))
     shifted = points[pole] + [0, 0.05, 0]
-    assert not free.seen_through(torch.from_numpy(shifted)).any()
+    assert not free.observed(torch.from_numpy(shifted))[0].any()
 
 
 def stored(worlds: dict[int, np.ndarray], speed_m_s: float = 0.0, interval_s: float = 0.1) -> list[RecordedSweep]:

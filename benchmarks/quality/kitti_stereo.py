@@ -29,7 +29,7 @@ from edge_depth_nerf.base.files import write_json, write_text
 from edge_depth_nerf.cameras import Pinhole
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.lidar import project_points, transform_points
-from edge_depth_nerf.lidar.sweeps import read_sweep
+from edge_depth_nerf.lidar.scans import ScanFormat, read_scan
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.lidar.world import sweep_in_world
 from edge_depth_nerf.method.alignment import align
@@ -66,7 +66,7 @@ BINS_M = (6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 50.0, 80.0)
 
 def lidar_map(path: Path, one_of: int) -> np.ndarray:
     """Distances of a sweep's rings, or of one of so many, in the picture."""
-    sweep = read_sweep(path)
+    sweep = read_scan(path, ScanFormat())
     points = sweep.points_m.numpy()
     elevation = np.degrees(np.arctan2(points[:, 2], np.linalg.norm(points[:, :2], axis=-1)))
     kept = torch.from_numpy(np.round((2 - elevation) / 26.8 * 63).astype(int) % one_of == 0)

@@ -28,7 +28,8 @@ from rich.progress import track
 from rich.table import Table
 
 from edge_depth_nerf.base.files import read_distance_png, read_mask
-from edge_depth_nerf.lidar import project_points, read_sweep, transform_points
+from edge_depth_nerf.lidar import project_points, transform_points
+from edge_depth_nerf.lidar.scans import ScanFormat, read_scan
 from edge_depth_nerf.lidar.world import sweep_in_world
 from edge_depth_nerf.process.kitti360.converter import read_kitti360
 from edge_depth_nerf.process.options import Kitti360Options
@@ -66,7 +67,7 @@ def deskewing(made: SynthesizeOptions) -> Table:
     errors: dict[str, list[NDArray]] = {"raw": [], "de-skewed": []}
     for recorded in found.sweeps:
         truth = np.fromfile(made.output / f"truth/{made.sequence}/points/{recorded.path.name}", "<f4").reshape(-1, 4)
-        sweep = read_sweep(recorded.path)
+        sweep = read_scan(recorded.path, ScanFormat())
         for name, deskew in (("raw", False), ("de-skewed", True)):
             world = sweep_in_world(
                 sweep, recorded.time_s, recorded.to_vehicle, found.trajectory, recorded.timing, deskew=deskew

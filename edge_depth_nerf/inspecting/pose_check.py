@@ -35,10 +35,7 @@ def check_poses(scene: SceneFolder, console: Console) -> list[EpipolarAgreement]
         return []
     cameras = scene.cameras()
     most = max(MEASURED_PICTURES // len(cameras), _LEAST_FRAMES)
-    jobs = [
-        partial(along_drive, [_posed(scene, picture) for picture in pictures], (1,), most)
-        for pictures in cameras.values()
-    ]
+    jobs = [partial(along_drive, [_posed(scene, each) for each in pictures], most) for pictures in cameras.values()]
     return [one for found in run_jobs(jobs, "Checking the poses against the pictures", console) for one in found]
 
 

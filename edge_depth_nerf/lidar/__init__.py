@@ -1,7 +1,7 @@
 """LiDAR: sweeps and their projection. Pure: tensors in, tensors out; no nerfstudio."""
 
 from edge_depth_nerf.lidar.projection import Projection, project_points, transform_points
-from edge_depth_nerf.lidar.sweeps import MAX_RANGE_M, MIN_RANGE_M, Sweep, SweepTiming, check_sweep_size, read_sweep
+from edge_depth_nerf.lidar.sweeps import MAX_RANGE_M, MIN_RANGE_M, Sweep, SweepTiming
 
 __all__ = [
     "MAX_RANGE_M",
@@ -9,8 +9,6 @@ __all__ = [
     "Projection",
     "Sweep",
     "SweepTiming",
-    "check_sweep_size",
     "project_points",
-    "read_sweep",
     "transform_points",
 ]

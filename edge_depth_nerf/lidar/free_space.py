@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from edge_depth_nerf.lidar.projection import transform_points
@@ -50,12 +50,12 @@ class FreeSpace:
         shortest = torch.full((rows * columns,), math.inf, dtype=torch.float32)
         flat = (row * columns + column)[inside]
         shortest.scatter_reduce_(0, flat, range_m[inside].float(), "amin")
-        free_to_m = _least_around(shortest.reshape(rows, columns))
-        return FreeSpace(world_to_scanner, lowest, cell_rad, torch.from_numpy(free_to_m))
-
-    def seen_through(self, points_in_world: Float[Tensor, "points 3"]) -> Bool[Tensor, "points"]:
-        """Whether beams passed each point and ended beyond it."""
-        return self.observed(points_in_world)[0]
+        image = shortest.reshape(rows, columns).numpy()
+        wrapped = np.concatenate((image[:, -1:], image, image[:, :1]), axis=1)
+        least = cv2.erode(wrapped, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)[:, 1:-1]
+        # a cell without a LiDAR point of its own is not known
+        free_to_m = torch.from_numpy(np.where(np.isfinite(image), least, 0).astype(np.float32))
+        return FreeSpace(world_to_scanner, lowest, cell_rad, free_to_m)
 
     def observed(
         self, points_in_world: Float[Tensor, "points 3"]
@@ -84,11 +84,3 @@ def _cells(
     row = ((torch.atan2(z, across) - lowest_rad) / cell_rad).floor().long()
     column = ((torch.atan2(y, x) / (2 * math.pi) + 0.5) * columns).long().clamp(max=columns - 1)
     return row, column, torch.hypot(across, z)
-
-
-def _least_around(shortest_m: Float32[Tensor, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:
-    """Take the least of each cell and its neighbours; 0 for a cell without a LiDAR point of its own."""
-    image = shortest_m.numpy()
-    wrapped = np.concatenate((image[:, -1:], image, image[:, :1]), axis=1)
-    least = cv2.erode(wrapped, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)[:, 1:-1]
-    return np.where(np.isfinite(image), least, 0).astype(np.float32)

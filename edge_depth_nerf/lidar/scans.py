@@ -22,10 +22,9 @@ from __future__ import annotations
 import math
 import struct
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -36,7 +35,7 @@ from jaxtyping import Float64, Shaped, UInt8
 
 from edge_depth_nerf.base.bounds import check_bytes, shown
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import ARRAY_ERRORS, load_npy, read_array_header, read_npz
+from edge_depth_nerf.base.files import load_npy, read_array_header, read_npz
 from edge_depth_nerf.lidar.sweeps import MAX_POINTS, Sweep, usable_points
 
 Encoding = Literal["records", "text", "lzf", "matrix", "archive", "table", "las"]
@@ -67,6 +66,8 @@ _ARROW_TYPES = {
     **{"halffloat": "f2", "float": "f4", "double": "f8"},
     **{f"{sign}int{8 * size}": f"{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)},
 }
+_LIBRARIES = {".feather": ("pyarrow", "'pyarrow<26'"), **dict.fromkeys((".las", ".laz"), ("laspy", "'.[las]'"))}
+"""What reads some formats, and how pip installs it."""
 _PLY_ENCODINGS: dict[str, tuple[Encoding, str]] = {
     "ascii": ("text", "<"),
     "binary_little_endian": ("records", "<"),
@@ -124,6 +125,8 @@ class _Header:
     table of Arrow's, or LAS."""
     offset: int = 0
     """Where the points begin, in bytes."""
+    array: str = ""
+    """Name of the points' array in an archive."""
 
 
 def read_scan(path: Path, scan: ScanFormat, time_s: float = 0.0) -> Sweep:
@@ -236,12 +239,30 @@ def check_scan(path: Path, scan: ScanFormat, most: int = MAX_POINTS) -> _Header:
     return header
 
 
+@contextmanager
+def _faults_named(path: Path) -> Iterator[None]:
+    """Make an InputError of whatever a library raises at a file, and of a library that is missing."""
+    try:
+        yield
+    except InputError:
+        raise
+    except ImportError:
+        library, install = _LIBRARIES[path.suffix.lower()]
+        raise InputError(
+            f"{path}: reading {path.suffix} scans needs {library}, which is not installed. Run `pip install "
+            f"{install}`, or convert the scans to .npz."
+        ) from None
+    except Exception as error:  # their readers raise whatever they meet
+        first_line = str(error).split("\n")[0]
+        raise InputError(f"{path}: cannot be read as {path.suffix} ({first_line}). {_AGAIN}") from None
+
+
 def _bin_header(path: Path, size: int, scan: ScanFormat) -> _Header:
     record = np.dtype([(name, np.dtype(scan.dtype).newbyteorder("<")) for name in scan.columns])
     if size % record.itemsize:
         raise InputError(
             f"{path}: {size} bytes, expected a multiple of {record.itemsize} ({', '.join(scan.columns)} as "
-            f"{scan.dtype}). The file is truncated, or its columns differ from the rig file's."
+            f"{scan.dtype}). The file is truncated, or has other columns (a rig file states them). {_AGAIN}"
         )
     return _Header(record, size // record.itemsize, "records")
 
@@ -252,11 +273,9 @@ def _npy_array(path: Path) -> np.ndarray:
         promised, size = file.tell() + math.prod(shape) * kind.itemsize, file.seek(0, 2)
     if promised > size:
         raise InputError(f"{path}: {size} bytes, but its header declares {shown(promised)}: truncated. {_AGAIN}")
-    try:
+    with _faults_named(path):
         # mapped: nothing is allocated
         return load_npy(path, "r")
-    except (*ARRAY_ERRORS, OSError) as error:
-        raise InputError(f"{path}: cannot be read as an array ({error}). {_AGAIN}") from error
 
 
 def _npy_header(path: Path, size: int, scan: ScanFormat) -> _Header:
@@ -277,48 +296,27 @@ def _array_header(path: Path, shape: tuple[int, ...], kind: np.dtype, scan: Scan
     )
 
 
-def _npz_name(path: Path, scan: ScanFormat) -> str:
-    """The name of the points' array in an archive."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: cannot be read as arrays ({error}). {_AGAIN}") from None
-    wanted = [scan.array] if scan.array is not None else names
-    if len(wanted) != 1 or wanted[0] not in names:
-        asked = f"no array {scan.array!r}" if scan.array is not None else f"{len(names)} arrays"
-        raise InputError(
-            f"{path}: {asked}; it holds {shown(names)}. Name the array with the points in the rig file, as array = "
-            "'data'."
-        )
-    return wanted[0]
-
-
 def _npz_header(path: Path, size: int, scan: ScanFormat) -> _Header:
-    name = _npz_name(path, scan)
-    try:
-        with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as member:
-            shape, _, kind = read_array_header(member, f"{path}: {name}")
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: cannot be read as arrays ({error}). {_AGAIN}") from None
-    return _array_header(path, shape, kind, scan, "archive")
+    with _faults_named(path), zipfile.ZipFile(path) as archive:
+        names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
+        wanted = [scan.array] if scan.array is not None else names
+        if len(wanted) != 1 or wanted[0] not in names:
+            asked = f"no array {scan.array!r}" if scan.array is not None else f"{len(names)} arrays"
+            raise InputError(
+                f"{path}: {asked}; it holds {shown(names)}. Name the array with the points in the rig file, as "
+                "array = 'data'."
+            )
+        with archive.open(f"{wanted[0]}.npy") as member:
+            shape, _, kind = read_array_header(member, f"{path}: {wanted[0]}")
+    return replace(_array_header(path, shape, kind, scan, "archive"), array=wanted[0])
 
 
 def _feather_table(path: Path, columns: list[str] | None = None) -> Any:
     """Open a table, its columns mapped into memory; compressed ones are unpacked when they are asked for."""
-    try:
-        from pyarrow import ArrowException, feather  # pyrefly: ignore[missing-import]
-    except ImportError:
-        raise InputError(
-            f"{path}: reading .feather scans needs pyarrow, which is not installed. Run `pip install "
-            "'pyarrow<26'`, or convert the scans to .npz."
-        ) from None
-    try:
+    with _faults_named(path):
+        from pyarrow import feather  # pyrefly: ignore[missing-import]
+
         return feather.read_table(path, columns=columns, memory_map=True)
-    except (ArrowException, OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: cannot be read as a table ({str(error).splitlines()[0]}). {_AGAIN}") from None
 
 
 def _feather_header(path: Path, size: int, scan: ScanFormat) -> _Header:
@@ -328,36 +326,19 @@ def _feather_header(path: Path, size: int, scan: ScanFormat) -> _Header:
     return _Header(_record(path, fields), table.num_rows, "table")
 
 
-@contextmanager
-def _las_reader(path: Path) -> Iterator[Any]:
-    """Open a .las or .laz file; what is wrong with it is an InputError."""
-    try:
-        import laspy
-    except ImportError:
-        raise InputError(
-            f"{path}: reading {path.suffix} scans needs laspy, which is not installed. Run `pip install "
-            "'.[las]'`, or convert the scans to .npz."
-        ) from None
-    try:
-        with laspy.open(path) as reader:
-            yield reader
-    except InputError:
-        raise
-    except Exception as error:  # laspy and lazrs raise whatever they meet
-        raise InputError(f"{path}: cannot be read as {path.suffix} ({error}). {_AGAIN}") from None
-
-
 def _las_header(path: Path, size: int, scan: ScanFormat) -> _Header:
-    with _las_reader(path) as reader:
-        head = reader.header
-        names = [name for name in head.point_format.dimension_names if name not in ("X", "Y", "Z")]
-        end = head.offset_to_point_data + head.point_count * head.point_format.size
-        if not head.are_points_compressed and end > size:
-            raise InputError(
-                f"{path}: {size} bytes, but its header declares {head.point_count} points, {end} bytes: truncated. "
-                f"{_AGAIN}"
-            )
-        return _Header(_record(path, [(name, "f8") for name in (*"xyz", *names)]), head.point_count, "las")
+    with _faults_named(path):
+        import laspy
+
+        with laspy.open(path) as reader:
+            head = reader.header
+    names = [name for name in head.point_format.dimension_names if name not in ("X", "Y", "Z")]
+    end = head.offset_to_point_data + head.point_count * head.point_format.size
+    if not head.are_points_compressed and end > size:
+        raise InputError(
+            f"{path}: {size} bytes, but its header declares {head.point_count} points, {end} bytes: truncated. {_AGAIN}"
+        )
+    return _Header(_record(path, [(name, "f8") for name in (*"xyz", *names)]), head.point_count, "las")
 
 
 def _header_lines(path: Path, file: BinaryIO, last: str) -> list[list[str]]:
@@ -440,20 +421,18 @@ def _read_columns(
 ) -> dict[str, Shaped[np.ndarray, "points"]]:
     """The columns wanted that there are, as float64."""
     names = [name for name in header.record.names or () if name in wanted]
-    if header.encoding == "matrix":
-        array = _npy_array(path)
-        index = {name: number for number, name in enumerate(scan.columns)}
-        picked = {name: array[name] if array.dtype.names else array[:, index[name]] for name in names}
-    elif header.encoding == "archive":
-        array = read_npz(path, [_npz_name(path, scan)], _MAX_TEXT_BYTES)
-        (matrix,) = array.values()
-        picked = {name: matrix[:, scan.columns.index(name)] for name in names}
+    if header.encoding in ("matrix", "archive"):
+        of_archive = header.encoding == "archive"
+        array = read_npz(path, [header.array], _MAX_TEXT_BYTES)[header.array] if of_archive else _npy_array(path)
+        picked = {name: array[name] if array.dtype.names else array[:, scan.columns.index(name)] for name in names}
     elif header.encoding == "table":
         table = _feather_table(path, names)
         picked = {name: table[name].to_numpy() for name in names}
     elif header.encoding == "las":
-        with _las_reader(path) as reader:
-            points = reader.read()
+        with _faults_named(path):
+            import laspy
+
+            points = laspy.read(path)
             picked = {name: np.asarray(points[name]) for name in names}
     elif header.encoding == "text":
         picked = _text_columns(path, header, names)
@@ -510,12 +489,6 @@ def _compressed_columns(path: Path, header: _Header, names: list[str]) -> dict[s
         content = None
     if content is None or len(content) != unpacked:
         raise InputError(f"{path}: its compressed points are damaged. {_AGAIN}")
-    found, start = {}, 0
-    for name in header.record.names or ():
-        field_type = header.record[name]
-        if name in names:
-            found[name] = np.frombuffer(
-                content, field_type.base, header.count * (field_type.itemsize // field_type.base.itemsize), start
-            )
-        start += header.count * field_type.itemsize
-    return found
+    fields = [(name, header.record[name]) for name in header.record.names or ()]
+    whole = np.frombuffer(content, [(name, kind.base, (header.count, *kind.shape)) for name, kind in fields])[0]
+    return {name: whole[name] for name in names}

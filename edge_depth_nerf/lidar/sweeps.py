@@ -1,4 +1,4 @@
-"""Reading LiDAR sweeps in KITTI's layout: float32 x, y, z, reflectance, little-endian, one point after another.
+"""LiDAR sweeps: the points of one turn of a scanner.
 
 Coordinates are metres in the scanner's frame (x forward, y left, z up), as recorded: the vehicle moves during a
 turn, and nothing is corrected for that here.
@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from edge_depth_nerf.base.bounds import check_bytes
 from edge_depth_nerf.base.errors import InputError
 
 MIN_RANGE_M = 0.5
@@ -24,7 +23,6 @@ MAX_RANGE_M = 255.0
 """Beyond this a distance map cannot hold the value; no scanner on a car measures so far."""
 MAX_POINTS = 5_000_000
 """A file of more points is no single scan."""
-_BYTES_PER_POINT = 16
 _CELL_BITS = 21
 """Bits of a cube's number along one axis."""
 
@@ -86,33 +84,6 @@ def without_beams(sweep: Sweep, one_of: int) -> tuple[Sweep, Sweep]:
         return replace(sweep, points_m=sweep.points_m[chosen], reflectance=sweep.reflectance[chosen], offset_s=offset_s)
 
     return part(~held_out), part(held_out)
-
-
-def check_sweep_size(path: Path) -> None:
-    """Check that the file holds whole points, and at least one, without reading it.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: the file is empty, truncated, or far larger than a sweep.
-    """
-    size = check_bytes(path, MAX_POINTS * _BYTES_PER_POINT)
-    if size == 0 or size % _BYTES_PER_POINT:
-        raise InputError(
-            f"{path}: {size} bytes, expected a multiple of {_BYTES_PER_POINT} above 0 (x, y, z, reflectance as "
-            "float32): the file is truncated. Copy it again, or delete it so that its frame is skipped."
-        )
-
-
-def read_sweep(path: Path) -> Sweep:
-    """Read a sweep and leave out what is not a measured point.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: the file is truncated, or nothing in it is a usable point.
-    """
-    check_sweep_size(path)
-    values = torch.from_numpy(np.fromfile(path, "<f4").reshape(-1, 4).astype(np.float64))
-    return usable_points(path, values[:, :3], values[:, 3])
 
 
 def usable_points(

@@ -24,17 +24,6 @@ MAX_POSE_GAP_S = 1.0
 """Between poses further apart than this the path is not known well enough to place pictures or points."""
 
 
-@dataclass(frozen=True)
-class _Screws:
-    """Each interval's motion: in the frame of its first pose, a point p goes to p + A(s)·p + B(s)·v."""
-
-    axis: Float64[np.ndarray, "intervals 3"]
-    """Unit axes of rotation; anything where nothing turns."""
-    angle_rad: Float64[np.ndarray, "intervals"]
-    velocity_m: Float64[np.ndarray, "intervals 3"]
-    """The translation's part of log(T0⁻¹·T1)."""
-
-
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Poses of a vehicle over time.
@@ -58,7 +47,12 @@ class Trajectory:
             )
 
     @cached_property
-    def _screws(self) -> _Screws:
+    def _screws(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Each interval's motion: in the frame of its first pose, a point p goes to p + A(s)·p + B(s)·v.
+
+        Unit axes of rotation (n×3; anything where nothing turns), angles (n×1, radians) and v (n×3, metres), which is
+        the translation's part of log(T0⁻¹·T1).
+        """
         rotation, position = self.vehicle_to_world[:, :3, :3], self.vehicle_to_world[:, :3, 3]
         turn = np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:]
         shift = np.einsum("nji,nj->ni", rotation[:-1], np.diff(position, axis=0))
@@ -70,12 +64,7 @@ class Trajectory:
         cotangent = np.where(angle > 1e-6, half / np.tan(np.where(angle > 1e-6, half, 1)), 1 - half**2 / 3)
         once = np.cross(axis, shift)
         velocity = shift - half[:, None] * once + (1 - cotangent)[:, None] * np.cross(axis, once)
-        return _Screws(axis, angle, velocity)
-
-    def _interval(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which interval a time lies in, and how far along; less than 0 or more than 1 beyond the ends."""
-        index = np.clip(np.searchsorted(self.times_s, times_s, side="right") - 1, 0, len(self.times_s) - 2)
-        return index, (times_s - self.times_s[index]) / (self.times_s[index + 1] - self.times_s[index])
+        return torch.from_numpy(axis), torch.from_numpy(angle[:, None]), torch.from_numpy(velocity)
 
     def gap_s(self, time_s: float) -> float:
         """How far apart the two poses around a time are; beyond the ends, infinite."""
@@ -106,12 +95,13 @@ class Trajectory:
         self, points_in_vehicle: Float[Tensor, "points 3"], times_s: Float[Tensor, "points"]
     ) -> Float[Tensor, "points 3"]:
         """Express points in the world, each by the vehicle's pose at its own time; float64."""
-        index_array, along_array = self._interval(times_s.numpy().astype(np.float64))
-        screws, points = self._screws, points_in_vehicle.to(torch.float64)
-        index, along = torch.from_numpy(index_array), torch.from_numpy(along_array)[:, None]
-        axis = torch.from_numpy(screws.axis)[index]
-        angle = along * torch.from_numpy(screws.angle_rad)[index][:, None]
-        velocity = along * torch.from_numpy(screws.velocity_m)[index]
+        times = times_s.to(torch.float64)
+        known = torch.from_numpy(self.times_s)
+        index = (torch.searchsorted(known, times, right=True) - 1).clamp(0, len(known) - 2)
+        # how far along the interval, less than 0 or more than 1 beyond the ends
+        along = ((times - known[index]) / (known[index + 1] - known[index]))[:, None]
+        axis, angle, velocity = (part[index] for part in self._screws)
+        points, angle, velocity = points_in_vehicle.to(torch.float64), along * angle, along * velocity
         small = angle.abs() < 1e-6
         safe = torch.where(small, torch.ones_like(angle), angle)
         # Rodrigues' formula, and the integral of it for the translation

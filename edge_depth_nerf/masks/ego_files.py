@@ -39,12 +39,9 @@ def keep_ego_mask(scene: Path, camera: str, mask: NDArray[np.bool_], could_tell:
 
 def vehicles_unknown(scene: Path) -> list[str]:
     """Cameras whose pictures did not tell where the vehicle is, and whose masks nobody has corrected since."""
-    found = []
-    for camera, digest in _unknown(scene).items():
-        path = ego_mask_path(scene, camera)
-        if path.is_file() and sha256_of(path) == digest:
-            found.append(camera)
-    return found
+    unknown = _unknown(scene)
+    there = [camera for camera in unknown if ego_mask_path(scene, camera).is_file()]
+    return [camera for camera in there if sha256_of(ego_mask_path(scene, camera)) == unknown[camera]]
 
 
 def _unknown(scene: Path) -> dict[str, object]:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from edge_depth_nerf.cameras import Camera
-from edge_depth_nerf.cameras.rays import rays
+from edge_depth_nerf.cameras.rays import Rays, rays
 from edge_depth_nerf.masks.regions import (
     block_mean,
     components,
@@ -135,14 +135,7 @@ def find_sky(
     if mono_m is not None:
         far &= (mono_m == 0) | (mono_m >= NEAR_M)
     possible = usable & ~dilated(lidar_points, 1.0) & (block_mean(far.astype(np.float32), factor) > 0.5)
-    blocks = _Blocks(
-        colour=block_mean(picture, factor).astype(np.float32),
-        usable=usable & seen.within,
-        possible=possible,
-        lidar_points=lidar_points,
-        directions=seen.directions,
-        height_sine=seen.directions @ up_in_camera.astype(np.float32),
-    )
+    blocks = _Blocks(block_mean(picture, factor).astype(np.float32), seen, usable, possible, lidar_points, up_in_camera)
     sky = _with_gaps(blocks, _grow(blocks, _regions(blocks)))
     if usable.any():
         # blocks that the mask cuts, along the lens's rim, are as those beside them
@@ -178,15 +171,16 @@ class _Blocks:
     def __init__(
         self,
         colour: Float32[np.ndarray, "h w 3"],
+        seen: Rays,
         usable: Bool[np.ndarray, "h w"],
         possible: Bool[np.ndarray, "h w"],
         lidar_points: Bool[np.ndarray, "h w"],
-        directions: Float32[np.ndarray, "h w 3"],
-        height_sine: Float[np.ndarray, "h w"],
+        up_in_camera: Float[np.ndarray, "3"],
     ) -> None:
         """Work out what the steps share."""
+        usable, height_sine = usable & seen.within, seen.directions @ up_in_camera.astype(np.float32)
         self.usable, self.lidar_points = usable, lidar_points
-        self.directions, self.height_sine = directions, height_sine
+        self.directions, self.height_sine = seen.directions, height_sine
         self.side = max(usable.shape)
         self.brightness = colour.max(-1)
         self.blue = np.log((colour[..., 2] + 8) / (colour[..., 0] + 8))
@@ -198,7 +192,7 @@ class _Blocks:
         soft = cv2.GaussianBlur(colour, (0, 0), 0.8)
         slope = np.hypot(cv2.Sobel(soft, -1, 1, 0, scale=1 / 8), cv2.Sobel(soft, -1, 0, 1, scale=1 / 8))
         self.smooth = slope.max(-1) <= _SMOOTH_LEVELS
-        beside = np.linalg.norm(np.diff(directions[:, : self.side // 2 + 1], axis=1), axis=-1)
+        beside = np.linalg.norm(np.diff(seen.directions[:, : self.side // 2 + 1], axis=1), axis=-1)
         inside = (usable[:, 1:] & usable[:, :-1])[:, : beside.shape[1]]
         self.degrees_per_px = math.degrees(float(np.median(beside[inside]))) if inside.any() else 1.0
 

@@ -67,7 +67,7 @@ from edge_depth_nerf.method.prior import (
     motion_sigma,
     ray_angles,
 )
-from edge_depth_nerf.mono.far_seen import seen_above, static_cloud
+from edge_depth_nerf.mono.far_seen import ELEVATION_QUANTILES, seen_above, static_cloud
 from edge_depth_nerf.mono.motion_seen import left_out_pixels
 from edge_depth_nerf.scene.format import CALIBRATION_FILE
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
@@ -82,8 +82,6 @@ HELD_OUT_PART = 0.1
 """So much of the blocks, and of the single LiDAR points, is held out."""
 HELD_OUT_ROWS = (0.1, 0.95)
 """In every second frame LiDAR points below and above these quantiles of their elevation are held out."""
-FIELD_QUANTILES = (0.001, 0.999)
-"""LiDAR's field of elevation, except for stray points."""
 _BEYOND_VERSION = 2
 """Part of the key of calibrations with motion: raised when they measure otherwise beyond LiDAR's field."""
 REACH_QUANTILE = 0.95
@@ -332,7 +330,7 @@ def _calibrate(
         )
 
     with_motion = _with_motion(scene, depth_source, options)
-    errors: MotionErrors | None = None
+    errors: tuple[float, float] | None = None
     field_rad = (0.0, 0.0)
 
     def measure(numbered: tuple[int, ScenePicture]) -> MeasuredFrame:
@@ -344,7 +342,7 @@ def _calibrate(
         if errors is not None and motion_m is not None:
             around_m = around_or_nothing(motion_m, maps.distances_m.get("motion_around"))
             beyond = ~_within(field_rad, view)
-            motion = MotionMap(motion_m, errors.weight, np.ones_like(maps.usable), beyond, around_m)
+            motion = MotionMap(motion_m, weight_of_errors(*errors), np.ones_like(maps.usable), beyond, around_m)
         far_seen_m = seen_above(cloud, scene, picture, (picture.lens.width, picture.lens.height))
         measured = measure_frame(
             *(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m, depth_source),
@@ -378,19 +376,6 @@ def _calibrate(
     return combine(frames, options, made_of, maps_trained_on(scene.meta) == "elsewhere", depth_source, errors)
 
 
-@dataclasses.dataclass(frozen=True)
-class MotionErrors:
-    """Relative errors of two sources where both have a distance: half of what 95 % are within."""
-
-    motion: float
-    mono: float
-
-    @property
-    def weight(self) -> float:
-        """Motion's part of their mean."""
-        return weight_of_errors(self.motion, self.mono)
-
-
 def _within(field_rad: tuple[float, float], view: RayAngles) -> NDArray[np.bool_]:
     """Rays in LiDAR's field, within its margin: as `Calibration.in_field`."""
     return Calibration("", None, None, field_rad, everywhere=False, drive_fit=None).in_field(view.elevation_rad)
@@ -399,7 +384,7 @@ def _within(field_rad: tuple[float, float], view: RayAngles) -> NDArray[np.bool_
 def _field_rad(elevations_rad: Sequence[NDArray[np.float32]]) -> tuple[float, float]:
     """LiDAR's field by the elevations of all LiDAR points."""
     every = np.concatenate(elevations_rad)
-    low, high = np.quantile(every, FIELD_QUANTILES) if len(every) else (0.0, 0.0)
+    low, high = np.quantile(every, ELEVATION_QUANTILES) if len(every) else (0.0, 0.0)
     return float(low), float(high)
 
 
@@ -424,13 +409,16 @@ def _errors_of_both(
     return errors, elevation_rad[maps.usable & (maps.lidar_m > 0)]  # pyrefly: ignore[bad-return]
 
 
-def _motion_errors(of_frames: Sequence[NDArray[np.float32]]) -> MotionErrors | None:
-    """Errors of both sources over all frames; None where too little was evaluated."""
+def _motion_errors(of_frames: Sequence[NDArray[np.float32]]) -> tuple[float, float] | None:
+    """Relative errors of motion and of the monocular maps over all frames: half of what 95 % are within.
+
+    None where too little was evaluated.
+    """
     found = np.concatenate(of_frames, 1)
     if found.shape[1] < LEAST_EVALUATED:
         return None
     motion, mono = np.quantile(found, 0.95, axis=1) / 2
-    return MotionErrors(float(motion), float(mono))
+    return float(motion), float(mono)
 
 
 def measure_frame(
@@ -466,7 +454,7 @@ def measure_frame(
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.lidar_points, view.theta_rad)
     measured_m, measured = lidar_m, left_out
     if far_seen_m is not None and lidar_points.any():
-        highest = np.quantile(view.elevation_rad[lidar_points], FIELD_QUANTILES[1]) + np.radians(FIELD_MARGIN_DEG)
+        highest = np.quantile(view.elevation_rad[lidar_points], ELEVATION_QUANTILES[1]) + np.radians(FIELD_MARGIN_DEG)
         far_seen = usable & (far_seen_m > 0) & ~lidar_points & (view.elevation_rad <= highest)
         measured_m, measured = np.where(far_seen, far_seen_m, lidar_m), left_out | far_seen
     evaluated = _some(measured & (frame.distance_m > 0), _EVALUATED_A_FRAME, rng)
@@ -558,12 +546,13 @@ def combine(
     made_of: str,
     everywhere: bool,
     depth_source: str = INTEGRATED,
-    motion_errors: MotionErrors | None = None,
+    motion_errors: tuple[float, float] | None = None,
 ) -> Calibration:
     """Put the measurements of a drive's frames, at least one, together.
 
     The key `made_of` is kept in the result; `everywhere` says whether the monocular maps are to be trusted beyond
-    LiDAR's field of elevation, and `motion_errors` by which errors motion took part in the frames' priors.
+    LiDAR's field of elevation, and `motion_errors` by which errors of motion and of these maps motion took part in the
+    frames' priors.
     """
     lidar_m, mono_m = (np.concatenate([getattr(frame, name) for frame in frames]) for name in ("lidar_m", "mono_m"))
     aligned = options.align != "none" and depth_source == INTEGRATED
@@ -578,7 +567,7 @@ def combine(
             errors = errors.where(~from_motion)
         if model is not None:
             beyond = _combine_beyond([frame.beyond for frame in frames if frame.beyond is not None])
-            motion = MotionCalibration(motion_errors.weight, motion_errors.motion, motion_errors.mono, model, beyond)
+            motion = MotionCalibration(weight_of_errors(*motion_errors), *motion_errors, model, beyond)
     return Calibration(
         made_of=made_of,
         error_model=errors.model(),

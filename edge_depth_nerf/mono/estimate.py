@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,6 @@ from rich.progress import Progress
 from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import sha256_of
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.method.alignment import LEAST_POINTS
@@ -35,12 +35,12 @@ from edge_depth_nerf.mono.elsewhere import FittedMaps
 from edge_depth_nerf.mono.examples import (
     LARGEST_SET_BYTES,
     Examples,
-    bytes_a_picture,
     camera_height_m,
     load_examples,
     network_view,
     room_radius_m,
     small_picture,
+    working_size,
 )
 from edge_depth_nerf.mono.far_seen import field_deg, seen_above, static_cloud
 from edge_depth_nerf.mono.files import find_maps
@@ -59,8 +59,8 @@ from edge_depth_nerf.mono.network import (
 )
 from edge_depth_nerf.mono.options import EstimateDepthOptions, Preset
 from edge_depth_nerf.mono.pinhole_views import pinhole_views
-from edge_depth_nerf.mono.relative import KIND_SAID, Layer
-from edge_depth_nerf.mono.training import Trained, TrainingOptions, as_json, torch_threads, train
+from edge_depth_nerf.mono.relative import Layer
+from edge_depth_nerf.mono.training import Trained, TrainingOptions, identity_of, torch_threads, train
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
@@ -102,20 +102,12 @@ PRESETS: dict[Preset, PresetValues] = {
 }
 
 
-@dataclass(frozen=True)
-class EstimateReport:
-    """What was done."""
-
-    weights: Path
-    """The file whose weights made the maps; of other sources than our own network the folder or name given."""
-    trained: Trained | None
-    """How it was trained, if it was now."""
-    predicted: int
-    """Pictures that got a map."""
-
-
-def estimate_depth(options: EstimateDepthOptions, console: Console | None = None) -> EstimateReport:
+def estimate_depth(options: EstimateDepthOptions, console: Console | None = None) -> tuple[Path, Trained | None]:
     """Get maps for all pictures of scenes, write them there, and measure how far they can be trusted.
+
+    Returns:
+        The file whose weights made the maps, of other sources than our own network the folder or name given; and how
+        it was trained, if it was now.
 
     Raises:
         FileNotFoundError: a scene, the weights or a map are not there.
@@ -124,12 +116,36 @@ def estimate_depth(options: EstimateDepthOptions, console: Console | None = None
     console = console or Console()
     assert options.cluster is None
     start, about, ready, scenes = opened(options)
+    trained = None
     with ExitStack() as stack:
         # in one order, lest two wait for each other
         for folder in sorted(scene.folder.resolve() for scene in scenes):
             stack.enter_context(only_writer(folder, console))
         # another process may have written to them meanwhile
-        return _estimate(options, [read_scene(path) for path in options.scenes], start, about, ready, console)
+        scenes = [read_scene(path) for path in options.scenes]
+        if ready is not None:
+            weights = Path(ready.name)
+            _write_predicted(ready, scenes, console)
+        elif options.maps is not None:
+            weights = options.maps
+            _write_from_files(options, scenes[0], console)
+        else:
+            if options.trains:
+                network, weights, about, trained = _train(scenes, options, start, console)
+            else:
+                assert start is not None and options.model is not None
+                network, weights = start, options.model
+            if not options.predict:
+                console.print(f"Weights, for --model: {weights}", soft_wrap=True)
+                return weights, trained
+            _write_own(network, weights, about, scenes, console)
+        count = sum(len(scene.pictures) for scene in scenes)
+        console.print(f"{count} pictures got a monocular map, from {weights}", soft_wrap=True)
+        for scene in scenes:
+            if scene.has("lidar"):
+                calibration = calibrate_scene(scene.path, console=console)
+                console.print(f"{scene.folder}: {calibration.headline()}", soft_wrap=True)
+    return weights, trained
 
 
 def opened(
@@ -148,40 +164,6 @@ def opened(
     if len({scene.path.resolve() for scene in scenes}) < len(scenes):
         raise InputError("the scene is given twice. Name each scene once.")
     return start, about, ready, scenes
-
-
-def _estimate(
-    options: EstimateDepthOptions,
-    scenes: Sequence[SceneFolder],
-    start: DepthNetwork | None,
-    about: dict[str, Any],
-    ready: ReadyNetwork | None,
-    console: Console,
-) -> EstimateReport:
-    trained = None
-    if ready is not None:
-        weights = Path(ready.name)
-        _write_predicted(ready, scenes, console)
-    elif options.maps is not None:
-        weights = options.maps
-        _write_from_files(options, scenes[0], console)
-    else:
-        if options.trains:
-            network, weights, about, trained = _train(scenes, options, start, console)
-        else:
-            assert start is not None and options.model is not None
-            network, weights = start, options.model
-        if not options.predict:
-            console.print(f"Weights, for --model: {weights}", soft_wrap=True)
-            return EstimateReport(weights, trained, 0)
-        _write_own(network, weights, about, scenes, console)
-    count = sum(len(scene.pictures) for scene in scenes)
-    console.print(f"{count} pictures got a monocular map, from {weights}", soft_wrap=True)
-    for scene in scenes:
-        if scene.has("lidar"):
-            calibration = calibrate_scene(scene.path, console=console)
-            console.print(f"{scene.folder}: {calibration.headline()}", soft_wrap=True)
-    return EstimateReport(weights, trained, count)
 
 
 # ---- sources of maps ---------------------------------------------------------------------------------------------
@@ -210,7 +192,8 @@ def _write_own(
 
 
 def _write_predicted(network: ReadyNetwork, scenes: Sequence[SceneFolder], console: Console) -> None:
-    console.print(f"{network.name}: {network.model_type}, {KIND_SAID[network.kind]}", soft_wrap=True)
+    fitted_to = "" if network.kind == "metric" else ", fitted to LiDAR"
+    console.print(f"{network.name}: {network.model_type}, {network.kind} maps{fitted_to}", soft_wrap=True)
     source = {
         "kind": "ready-made network",
         "trained_on": "elsewhere",
@@ -229,15 +212,15 @@ def _write_predicted(network: ReadyNetwork, scenes: Sequence[SceneFolder], conso
 
 def _write_from_files(options: EstimateDepthOptions, scene: SceneFolder, console: Console) -> None:
     assert options.maps is not None and options.maps_kind is not None and options.maps_along is not None
-    files = find_maps(scene, options.maps, options.maps_kind, options.maps_along, options.metres_per_count)
+    layers = find_maps(scene, options.maps, options.maps_kind, options.maps_along, options.metres_per_count)
     source = {
         "kind": "files",
         "trained_on": options.maps_trained_on or "elsewhere",
         "folder": options.maps.resolve().name,
-        "output": files.kind,
-        "along": files.along,
+        "output": options.maps_kind,
+        "along": options.maps_along,
     }
-    _write_fitted([FittedMaps(scene, files.kind, lambda picture: [files.layer(scene, picture)])], source, console)
+    _write_fitted([FittedMaps(scene, options.maps_kind, layers)], source, console)
 
 
 def _write_fitted(every: Sequence[FittedMaps], source: dict[str, Any], console: Console) -> None:
@@ -272,13 +255,10 @@ def _train(
     found, about = _weights_of_before(weights, options, scenes[0].folder / WEIGHTS, console)
     settings = start.settings if start else NetworkSettings(preset.channels, preset.working_px, _EYE_LEVEL_M, 1.0)
     with progress_bars(console) as progress:
-        material = _gather(scenes, settings, console, progress)
+        used, examples, kept, mean_height_m, reached_deg = _gather(scenes, settings, console, progress)
         if start is None:
-            radius_m = room_radius_m(material.examples)
-            settings = replace(settings, camera_height_m=material.mean_height_m, room_radius_m=radius_m)
-        began_with = None if options.model is None else sha256_of(options.model)
-        made_of = {"training": asdict(training), "settings": asdict(settings), "start": began_with}
-        identity = as_json({**made_of, "examples": material.examples.fingerprint()})
+            settings = replace(settings, camera_height_m=mean_height_m, room_radius_m=room_radius_m(examples))
+        identity = identity_of(examples, settings, training, start)
         if found is not None and about.get("identity") == identity:
             console.print(f"{weights} is trained already", soft_wrap=True)
             checkpoint.unlink(missing_ok=True)
@@ -289,48 +269,33 @@ def _train(
             said = "" if np.isinf(error) else f", error {error:.1%} of the distance"
             progress.update(task, completed=share, description=f"Training{said}")
 
-        trained = train(
-            material.examples, material.kept, settings, training, start=start, checkpoint=checkpoint, report=report
-        )
+        trained = train(examples, kept, settings, training, start=start, checkpoint=checkpoint, report=report)
     about = {
         "made_by": f"edge-depth-nerf {__version__}",
         "preset": options.preset,
         "steps": trained.best_step,
-        "abs_rel": None if material.kept is None else round(trained.abs_rel, 5),
+        "abs_rel": None if kept is None else round(trained.abs_rel, 5),
         "scenes": [_name(scene) for scene in scenes],
         "trained_frames": {
-            _key(scene): [picture.name for picture in used]
-            for scene, (used, _) in zip(scenes, material.split, strict=True)
+            _key(scene): [picture.name for picture in pictures] for scene, pictures in zip(scenes, used, strict=True)
         },
-        "field_deg": material.field_deg,
+        "field_deg": reached_deg,
         "identity": identity,
     }
     save_network(weights, trained.network, about)
     checkpoint.unlink(missing_ok=True)
-    _say_trained(trained, training, material, console)
+    _say_trained(trained, training, examples, kept, console)
     return trained.network, weights, about, trained
-
-
-@dataclass(frozen=True)
-class _Material:
-    """What a network is trained on."""
-
-    split: list[Split]
-    """Of each scene, the pictures to train on and those kept for stopping."""
-    examples: Examples
-    """The pictures to train on."""
-    kept: Examples | None
-    """Those kept for stopping; None if they measured nothing."""
-    mean_height_m: float
-    """Of the cameras above the ground."""
-    field_deg: list[float]
-    """Least and largest elevation that LiDAR reached."""
 
 
 def _gather(
     scenes: Sequence[SceneFolder], settings: NetworkSettings, console: Console, progress: Progress
-) -> _Material:
+) -> tuple[list[list[ScenePicture]], Examples, Examples | None, float, list[float]]:
     """Read the pictures and LiDAR of scenes.
+
+    Returns:
+        The pictures of each scene to train on; these read; those kept for stopping read, None if they measured nothing;
+        the mean height of the cameras above the ground; the least and the largest elevation that LiDAR reached.
 
     Raises:
         InputError: no LiDAR point lies in any training picture.
@@ -368,19 +333,21 @@ def _gather(
     known = [field for field in fields if field is not None]
     mean_height_m = float(np.mean([height for by_camera in heights for height in by_camera.values()]))
     limits_deg = [min(low for low, _ in known), max(high for _, high in known)]
-    return _Material(split, examples, kept, mean_height_m, limits_deg)
+    return training, examples, kept, mean_height_m, limits_deg
 
 
-def _say_trained(trained: Trained, training: TrainingOptions, material: _Material, console: Console) -> None:
+def _say_trained(
+    trained: Trained, training: TrainingOptions, examples: Examples, kept: Examples | None, console: Console
+) -> None:
     short = not trained.stopped_early and trained.steps < training.steps
     early = ", where it stopped early" if trained.stopped_early else ""
     if short:
         early = f" of {training.steps:,}, where the time limit was reached,"
     error = ""
-    if material.kept is not None:
-        error = f"; error on the {len(material.kept)} pictures set aside for early stopping: {trained.abs_rel:.1%}"
+    if kept is not None:
+        error = f"; error on the {len(kept)} pictures set aside for early stopping: {trained.abs_rel:.1%}"
     console.print(
-        f"Trained {trained.steps} steps{early} in {trained.seconds:.0f} s on {len(material.examples)} pictures{error}",
+        f"Trained {trained.steps} steps{early} in {trained.seconds:.0f} s on {len(examples)} pictures{error}",
         soft_wrap=True,
     )
     if short and trained.steps < _FEW_STEPS:
@@ -459,7 +426,9 @@ def training_split(scene: SceneFolder) -> Split:
 def _thinned(split: list[Split], working_px: int, weighted: bool, console: Console) -> list[Split]:
     """Take every k-th picture where all would not fit in memory."""
     pictures = [picture for both in split for pictures in both for picture in pictures]
-    most = LARGEST_SET_BYTES // bytes_a_picture(pictures, working_px, weighted)
+    pixels = max(math.prod(working_size(p.lens.width, p.lens.height, working_px)) for p in pictures)
+    # colours, distance and mask, and perhaps the distance's weight
+    most = LARGEST_SET_BYTES // (pixels * (3 + 4 + 1 + 4 * weighted))
     step = -(-len(pictures) // most)
     if step > 1:
         console.print(f"{len(pictures)} pictures would not fit in memory: every {step}th is used", soft_wrap=True)
@@ -524,8 +493,8 @@ def predict(
 ) -> Float32[np.ndarray, "h w"]:
     """Predict one picture at its own size, metres along the ray."""
     settings = network.settings
-    view = network_view(scene, picture, settings.working_px)
-    rows, columns = view.usable.shape
+    rays, usable = network_view(scene, picture, settings.working_px)
+    rows, columns = usable.shape
     rgb = small_picture(scene, picture, (columns, rows))
 
     def padded(values: np.ndarray) -> torch.Tensor:
@@ -533,12 +502,13 @@ def predict(
         values = np.pad(values, [*margins, *[(0, 0)] * (values.ndim - 2)])
         return torch.from_numpy(values)[None].to(device)
 
-    up, height = (torch.from_numpy(np.asarray(v, np.float32))[None].to(device) for v in (view.up_in_camera, height_m))
-    geometry, _ = ray_geometry(padded(view.rays), up, height, settings)
+    up_in_camera = picture.up_in_camera.astype(np.float32)
+    up, height = (torch.from_numpy(np.asarray(v, np.float32))[None].to(device) for v in (up_in_camera, height_m))
+    geometry, _ = ray_geometry(padded(rays), up, height, settings)
     seen = padded(rgb).permute(0, 3, 1, 2).float() / 255.0
-    log_ratio = network(seen, geometry, padded(view.usable))[0, :rows, :columns].cpu().numpy()
+    log_ratio = network(seen, geometry, padded(usable))[0, :rows, :columns].cpu().numpy()
     # the ratio is smooth, the room is known exactly at any size
     log_ratio = cv2.resize(log_ratio, (picture.lens.width, picture.lens.height), interpolation=cv2.INTER_LINEAR)
-    height_sine = torch.from_numpy(scene.rays(picture).directions @ view.up_in_camera).clamp(-1.0, 1.0)
+    height_sine = torch.from_numpy(scene.rays(picture).directions @ up_in_camera).clamp(-1.0, 1.0)
     log_room = log_room_distance(height_sine, height_m, settings.room_radius_m)
     return distance_m(torch.from_numpy(log_ratio), log_room).numpy()

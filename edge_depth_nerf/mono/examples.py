@@ -36,16 +36,6 @@ _MIN_GROUND_POINTS = 100
 
 
 @dataclass(frozen=True)
-class NetworkView:
-    """One picture at the network's size, without its colours."""
-
-    rays: Float32[np.ndarray, "h w 3"]
-    usable: Bool[np.ndarray, "h w"]
-    up_in_camera: Float32[np.ndarray, "3"]
-    """Unit vector against gravity."""
-
-
-@dataclass(frozen=True)
 class Examples:
     """Pictures to train on or to evaluate on."""
 
@@ -64,16 +54,15 @@ class Examples:
     def __len__(self) -> int:
         return len(self.rgb)
 
-    def fingerprint(self) -> str:
-        """What tells one set from another."""
-        digest = hashlib.sha256()
-        for field in dataclasses.fields(self):
-            values: np.ndarray | None = getattr(self, field.name)
-            if values is None:
-                continue
-            digest.update(f"{field.name}{values.dtype}{values.shape}".encode())
+
+def fingerprint(arrays: Mapping[str, np.ndarray | None]) -> str:
+    """What tells some arrays with names from others."""
+    digest = hashlib.sha256()
+    for name, values in arrays.items():
+        if values is not None:
+            digest.update(f"{name}{values.dtype}{values.shape}".encode())
             digest.update(np.ascontiguousarray(values).data)
-        return digest.hexdigest()[:32]
+    return digest.hexdigest()[:32]
 
 
 def working_size(width: int, height: int, working_px: int) -> tuple[int, int]:
@@ -84,7 +73,9 @@ def working_size(width: int, height: int, working_px: int) -> tuple[int, int]:
     return max(round(width * working_px / longer), 1), max(round(height * working_px / longer), 1)
 
 
-def network_view(scene: SceneFolder, picture: ScenePicture, working_px: int, masked: bool = True) -> NetworkView:
+def network_view(
+    scene: SceneFolder, picture: ScenePicture, working_px: int, masked: bool = True
+) -> tuple[Float32[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Rays and mask of a picture at the network's size; without its mask all that the lens sees is usable."""
     size = working_size(picture.lens.width, picture.lens.height, working_px)
     found = rays(scaled_lens(picture.lens, size), scene.theta_max_rad)
@@ -92,7 +83,7 @@ def network_view(scene: SceneFolder, picture: ScenePicture, working_px: int, mas
     if mask is not None:
         # a pixel that a masked one is mixed into is masked as well
         usable = usable & (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999)
-    return NetworkView(found.directions, usable, picture.up_in_camera.astype(np.float32))
+    return found.directions, usable
 
 
 def scaled_lens(lens: KannalaBrandt | Pinhole, size: tuple[int, int]) -> KannalaBrandt | Pinhole:
@@ -135,39 +126,33 @@ def load_examples(
     index = 0
     for number, (scene, pictures, height_m) in enumerate(zip(scenes, chosen, heights_m, strict=True)):
         for picture in pictures:
-            view = network_view(scene, picture, working_px)
-            rows, columns = view.usable.shape
+            directions, used = network_view(scene, picture, working_px)
+            rows, columns = used.shape
             part = (index, slice(0, rows), slice(0, columns))
             rgb[part] = small_picture(scene, picture, (columns, rows))
-            known_m = small_lidar(scene, picture, view)
+            known_m = reduced(scene.lidar_m(picture), used)
             if far_seen is not None:
                 # at twice the size it is told better what is hidden
                 twice = working_size(picture.lens.width, picture.lens.height, 2 * working_px)
-                known_m = np.where(known_m > 0, known_m, _reduced(far_seen[number](picture, twice), view))
+                known_m = np.where(known_m > 0, known_m, reduced(far_seen[number](picture, twice), used))
             of_motion = by_motion[number] if by_motion is not None else None
             if of_motion is not None and weight is not None and (found := of_motion(picture)) is not None:
-                motion_m, of_each = (_reduced(values, view) for values in found)
+                motion_m, of_each = (reduced(values, used) for values in found)
                 weight[part] = np.where(known_m > 0, np.float32(1), of_each)
                 known_m = np.where(known_m > 0, known_m, motion_m)
             lidar_m[part] = known_m
-            usable[part] = view.usable
+            usable[part] = used
             key = (picture.lens, scene.theta_max_rad)
             if key not in rays_of:
                 padded = np.zeros((height, width, 3), np.float32)
-                padded[:rows, :columns] = view.rays
+                padded[:rows, :columns] = directions
                 rays_of[key] = (len(rays_of), padded)
             lenses[index] = rays_of[key][0]
-            ups[index], heights[index] = view.up_in_camera, height_m[picture.camera]
+            ups[index], heights[index] = picture.up_in_camera, height_m[picture.camera]
             index += 1
             advance()
     all_rays = np.stack([padded for _, padded in rays_of.values()])
     return Examples(rgb, lidar_m, usable, all_rays, lenses, ups, heights, weight)
-
-
-def bytes_a_picture(pictures: Sequence[ScenePicture], working_px: int, weighted: bool = False) -> int:
-    """Memory that one picture takes at most, with or without weights of its distances."""
-    largest = max(np.prod(working_size(p.lens.width, p.lens.height, working_px)) for p in pictures)  # pyrefly: ignore
-    return int(largest) * (3 + 4 + 1 + 4 * weighted)
 
 
 def small_picture(scene: SceneFolder, picture: ScenePicture, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
@@ -175,15 +160,12 @@ def small_picture(scene: SceneFolder, picture: ScenePicture, size: tuple[int, in
     return np.asarray(cv2.resize(scene.rgb(picture), size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def small_lidar(scene: SceneFolder, picture: ScenePicture, view: NetworkView) -> Float32[np.ndarray, "h w"]:
-    """LiDAR at the network's size: of the LiDAR points in a pixel the one nearest to its centre."""
-    return _reduced(scene.lidar_m(picture), view)
-
-
-def _reduced(lidar_m: Float32[np.ndarray, "rows columns"], view: NetworkView) -> Float32[np.ndarray, "h w"]:
+def reduced(
+    lidar_m: Float32[np.ndarray, "rows columns"], usable: Bool[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "h w"]:
     """A sparse map at the size of a view: of the values in a pixel the one nearest to its centre."""
     full_rows, full_columns = lidar_m.shape
-    rows, columns = view.usable.shape
+    rows, columns = usable.shape
     row, column = np.nonzero(lidar_m)
     y, x = (row + 0.5) * rows / full_rows, (column + 0.5) * columns / full_columns
     small_row, small_column = y.astype(np.int64), x.astype(np.int64)
@@ -192,7 +174,7 @@ def _reduced(lidar_m: Float32[np.ndarray, "rows columns"], view: NetworkView) ->
     small = np.zeros((rows, columns), np.float32)
     # of several values for one pixel the last one stays
     small[small_row[farthest_first], small_column[farthest_first]] = lidar_m[row, column][farthest_first]
-    small[~view.usable] = 0
+    small[~usable] = 0
     return small
 
 
@@ -200,9 +182,9 @@ def camera_height_m(scene: SceneFolder, pictures: Sequence[ScenePicture], workin
     """Metres of the cameras above the ground, from some pictures' LiDAR points below the horizon; None for too few."""
     depths = []
     for picture in pictures:
-        view = network_view(scene, picture, working_px, masked=False)
-        lidar_m = small_lidar(scene, picture, view)
-        height_sine = view.rays @ view.up_in_camera
+        directions, seen = network_view(scene, picture, working_px, masked=False)
+        lidar_m = reduced(scene.lidar_m(picture), seen)
+        height_sine = directions @ picture.up_in_camera.astype(np.float32)
         below = (lidar_m > 0) & (height_sine < _GROUND_SINE)
         depths.append((-lidar_m * height_sine)[below])
     below_m = np.concatenate(depths) if depths else np.empty(0)

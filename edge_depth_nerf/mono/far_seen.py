@@ -78,17 +78,6 @@ class Cloud:
         return around[off_m[:, 0] ** 2 + off_m[:, 1] ** 2 <= REACH_M**2]
 
 
-@dataclass(frozen=True)
-class _Field:
-    """What a picture's own LiDAR points reach."""
-
-    top_sine: float
-    """Sine of their highest elevation, except for a few; 1 without LiDAR points."""
-    reach_m: Float32[np.ndarray, "azimuths"]
-    """How far off, horizontally, the picture can see above them, by azimuth. The thing that a LiDAR point at the upper
-    edge belongs to may continue above it, as a house does, and hide what is behind."""
-
-
 def static_cloud(
     scene: SceneFolder, pictures: Sequence[ScenePicture], advance: Callable[[], None] = lambda: None
 ) -> Cloud:
@@ -101,7 +90,7 @@ def static_cloud(
     """
     tops = []
     for picture in pictures:
-        tops.append(_field(scene, picture).top_sine)
+        tops.append(_field(scene, picture)[0])
         advance()
     points, spacings = [np.empty((0, 3))], [np.empty(0, np.float32)]
     collected, thinned = 0, 0
@@ -138,17 +127,17 @@ def seen_above(
 
     The picture has LiDAR; the size of the map is width and height.
     """
-    field = _field(scene, picture)
+    top_sine, reach_m = _field(scene, picture)
     near = cloud.part(cloud.near(picture))
-    high = near.part(_is_above(picture, near.points_m, field.top_sine))
-    in_camera, spacing_m = torch.from_numpy(_to_camera(picture, high.points_m)), torch.from_numpy(high.spacing_m)
+    high = near.part(_is_above(picture, near.points_m, top_sine))
+    in_camera = torch.from_numpy((high.points_m - picture.position_m) @ picture.pose[:3, :3])
     lens = scaled_lens(picture.lens, size)
-    projected = project_points(in_camera, lens, spacing_m=spacing_m)
+    projected = project_points(in_camera, lens, spacing_m=torch.from_numpy(high.spacing_m))
     distance_m = projected.distance_m.float().numpy()
     found = rays(lens, scene.theta_max_rad)
     sine = found.directions @ picture.up_in_camera.astype(np.float32)
-    visible = _level_m(distance_m, sine) <= field.reach_m[_azimuth(picture, found.directions)]
-    return np.where(found.within & (sine > field.top_sine) & visible, distance_m, np.float32(0))
+    visible = _level_m(distance_m, sine) <= reach_m[_azimuth(picture, found.directions)]
+    return np.where(found.within & (sine > top_sine) & visible, distance_m, np.float32(0))
 
 
 def field_deg(
@@ -177,18 +166,23 @@ def field_deg(
     return round(float(edges[low]), 2), round(float(edges[high + 1]), 2)
 
 
-def _field(scene: SceneFolder, picture: ScenePicture) -> _Field:
+def _field(scene: SceneFolder, picture: ScenePicture) -> tuple[float, Float32[np.ndarray, "azimuths"]]:
+    """What a picture's own LiDAR points reach: the sine of their highest elevation, except for a few; 1 without any.
+
+    And how far off, horizontally, the picture can see above them, by azimuth. The thing that a LiDAR point at the upper
+    edge belongs to may continue above it, as a house does, and hide what is behind.
+    """
     rays, lidar_m = _own(scene, picture)
     rays, lidar_m = rays[lidar_m > 0], lidar_m[lidar_m > 0]
     if not len(lidar_m):
-        return _Field(1.0, np.zeros(_AZIMUTHS, np.float32))
+        return 1.0, np.zeros(_AZIMUTHS, np.float32)
     sine, azimuth = rays @ picture.up_in_camera.astype(np.float32), _azimuth(picture, rays)
     highest_m = np.full(_AZIMUTHS, np.inf, np.float32)
     # of several values for one azimuth the last one stays
     upward = np.argsort(sine, kind="stable")
     highest_m[azimuth[upward]] = _level_m(lidar_m, sine)[upward]
     nearest_m = np.minimum(np.minimum(np.roll(highest_m, 1), np.roll(highest_m, -1)), highest_m)
-    return _Field(float(np.quantile(sine, FIELD_QUANTILE)), (_SAME * nearest_m + _SAME_M).astype(np.float32))
+    return float(np.quantile(sine, FIELD_QUANTILE)), (_SAME * nearest_m + _SAME_M).astype(np.float32)
 
 
 def _level_m(distance_m: NDArray[np.float32], sine: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -198,7 +192,7 @@ def _level_m(distance_m: NDArray[np.float32], sine: NDArray[np.float32]) -> NDAr
 
 def _azimuth(picture: ScenePicture, rays: Float32[np.ndarray, "*shape 3"]) -> NDArray[np.intp]:
     """Which of the azimuths rays in the camera's frame have in the world."""
-    world = (rays * np.array([1.0, -1.0, -1.0])) @ picture.rotation.T
+    world = rays @ picture.pose[:3, :3].T
     turn = np.arctan2(world[..., 1], world[..., 0]) / (2 * np.pi) + 0.5
     return (turn * _AZIMUTHS).astype(np.intp) % _AZIMUTHS
 
@@ -241,15 +235,11 @@ def _own(scene: SceneFolder, picture: ScenePicture) -> tuple[Float32[np.ndarray,
     return scene.rays(picture).directions, lidar_m
 
 
-def _to_camera(picture: ScenePicture, points_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    return (points_m - picture.position_m) @ picture.rotation * np.array([1.0, -1.0, -1.0])
-
-
 def _votes(
     picture: ScenePicture, points_m: Float64[np.ndarray, "n 3"], lidar_m: Float32[np.ndarray, "h w"]
 ) -> Int32[np.ndarray, "n"]:
     """1 for each point that the picture's own LiDAR points confirm, -1 for each that they saw through, else 0."""
-    in_camera = torch.from_numpy(_to_camera(picture, points_m))
+    in_camera = torch.from_numpy((points_m - picture.position_m) @ picture.pose[:3, :3])
     pixels, valid = picture.lens.project(in_camera)
     seen = (valid & picture.lens.inside(pixels)).numpy()
     column, row = pixels[torch.from_numpy(seen)].long().unbind(-1)

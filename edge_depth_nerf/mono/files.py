@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,39 +18,15 @@ from edge_depth_nerf.mono.relative import Kind, Layer
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 
-@dataclass(frozen=True)
-class MapFiles:
-    """The maps of one scene, checked by their headers."""
-
-    by_picture: Mapping[str, Path]
-    """File of each picture, by the picture's file_path."""
-    kind: Kind
-    along: Along
-    metres_per_count: float
-    """Of PNGs."""
-
-    def layer(self, scene: SceneFolder, picture: ScenePicture) -> Layer:
-        """Read a picture's map.
-
-        Raises:
-            InputError: it cannot be read, or holds no positive number.
-        """
-        path = self.by_picture[picture.name]
-        values = read_map(path, self.metres_per_count)
-        if np.isnan(values).all():
-            raise InputError(
-                f"{path}: contains no positive number, only zeros, negative numbers, NaN or infinity. "
-                "Make it again, or leave the frame out of the scene."
-            )
-        cosine = np.ones(values.shape, np.float32) if self.along == "ray" else scene.rays(picture).cos_theta
-        whole = slice(0, picture.lens.height), slice(0, picture.lens.width)
-        return Layer(whole, values, cosine, (cosine >= LEAST_COSINE).astype(np.float32))
-
-
-def find_maps(scene: SceneFolder, folder: Path, kind: Kind, along: Along, metres_per_count: float | None) -> MapFiles:
+def find_maps(
+    scene: SceneFolder, folder: Path, kind: Kind, along: Along, metres_per_count: float | None
+) -> Callable[[ScenePicture], list[Layer]]:
     """Find a map for every picture of a scene, and check all by their headers.
 
     The folder holds CAMERA/FRAME.npy or .png, with the names of the scene's cameras and pictures.
+
+    Returns:
+        What reads a picture's map, and raises as `read_maps`.
 
     Raises:
         FileNotFoundError: the folder or a map is not there.
@@ -66,7 +41,15 @@ def find_maps(scene: SceneFolder, folder: Path, kind: Kind, along: Along, metres
         camera = [part for part in Path(picture.camera).parts if part not in ("..", "/")]
         stem = folder.joinpath(*camera, Path(picture.name).stem)
         found[picture.name] = find_map(stem, picture.name, (picture.lens.width, picture.lens.height))
-    return MapFiles(found, kind, along, count_m(folder, found.values(), kind, metres_per_count))
+    metres = count_m(folder, found.values(), kind, metres_per_count)
+
+    def layer(picture: ScenePicture) -> list[Layer]:
+        (values,) = read_maps([found[picture.name]], metres)
+        cosine = np.ones(values.shape, np.float32) if along == "ray" else scene.rays(picture).cos_theta
+        whole = slice(0, picture.lens.height), slice(0, picture.lens.width)
+        return [Layer(whole, values, cosine, (cosine >= LEAST_COSINE).astype(np.float32))]
+
+    return layer
 
 
 def count_m(folder: Path, paths: Iterable[Path], kind: Kind, metres_per_count: float | None) -> float:
@@ -105,7 +88,16 @@ def find_map(stem: Path, picture: str, size: tuple[int, int]) -> Path:
         )
     if len(there) > 1:
         raise InputError(f"{there[0]}: {there[1].name} exists as well. Keep one map for each picture.")
-    height, width = npy_shape(there[0]) if there[0].suffix == ".npy" else _png_shape(there[0])
+    if there[0].suffix == ".npy":
+        height, width = npy_shape(there[0])
+    else:
+        header = read_png_header(there[0])
+        if not header.is_distance:
+            raise InputError(
+                f"{there[0]}: {header.bit_depth}-bit {header.colour}, expected a 16-bit grey PNG. Other kinds have "
+                "lost the distance; export the map again, best as .npy."
+            )
+        height, width = header.height, header.width
     if (width, height) != size:
         raise InputError(
             f"{there[0]}: is {width}×{height} (width × height), its picture {picture} {size[0]}×{size[1]}. A map needs "
@@ -114,20 +106,29 @@ def find_map(stem: Path, picture: str, size: tuple[int, int]) -> Path:
     return there[0]
 
 
-def read_map(path: Path, metres_per_count: float) -> NDArray[np.float32]:
-    """Read a map, H×W; NaN where it has no positive, finite number."""
-    values = read_npy(path) if path.suffix == ".npy" else read_distance_png(path, metres_per_count)
-    return np.where(np.isfinite(values) & (values > 0), values, np.float32(np.nan))
+def read_maps(paths: Sequence[Path], metres_per_count: float) -> list[NDArray[np.float32]]:
+    """Read the maps of a picture, H×W each; NaN where there is no positive, finite number.
 
-
-def _png_shape(path: Path) -> tuple[int, int]:
-    header = read_png_header(path)
-    if not header.is_distance:
+    Raises:
+        InputError: one cannot be read, or none holds a positive number.
+    """
+    maps = []
+    for path in paths:
+        if path.suffix == ".npy":
+            shape = npy_shape(path)
+            # beyond float32's range is infinity, which is no distance
+            with np.errstate(over="ignore"):
+                values = load_npy(path).reshape(shape).astype(np.float32)
+        else:
+            values = read_distance_png(path, metres_per_count)
+        maps.append(np.where(np.isfinite(values) & (values > 0), values, np.float32(np.nan)))
+    if all(np.isnan(each).all() for each in maps):
+        others = ", and so do those of the picture's other views" if len(paths) > 1 else ""
         raise InputError(
-            f"{path}: {header.bit_depth}-bit {header.colour}, expected a 16-bit grey PNG. Other kinds have lost the "
-            "distance; export the map again, best as .npy."
+            f"{paths[0]}: contains no positive number, only zeros, negative numbers, NaN or infinity{others}. "
+            "Make it again, or leave its picture out."
         )
-    return header.height, header.width
+    return maps
 
 
 def npy_shape(path: Path) -> tuple[int, int]:
@@ -151,15 +152,3 @@ def npy_shape(path: Path) -> tuple[int, int]:
             "file again."
         )
     return sides[0], sides[1]
-
-
-def read_npy(path: Path) -> NDArray[np.float32]:
-    """Read a map, H×W.
-
-    Raises:
-        InputError: as `npy_shape`.
-    """
-    shape = npy_shape(path)
-    # beyond float32's range is infinity, which is no distance
-    with np.errstate(over="ignore"):
-        return load_npy(path).reshape(shape).astype(np.float32)

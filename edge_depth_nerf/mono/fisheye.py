@@ -37,9 +37,9 @@ from edge_depth_nerf.cameras.calibration_file import read_lens
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.masks.lens import dark_rim
 from edge_depth_nerf.mono.elsewhere import agreed
-from edge_depth_nerf.mono.files import count_m, find_map, read_map
+from edge_depth_nerf.mono.files import count_m, find_map, read_maps
 from edge_depth_nerf.mono.hf import load_ready_network, view_layers
-from edge_depth_nerf.mono.options import Along, FisheyeDepthOptions
+from edge_depth_nerf.mono.options import FisheyeDepthOptions
 from edge_depth_nerf.mono.pinhole_views import PinholeView, pinhole_views
 from edge_depth_nerf.mono.relative import Kind, Layer
 from edge_depth_nerf.scene.checks import check_picture_size
@@ -110,8 +110,14 @@ def fisheye_depth(options: FisheyeDepthOptions, console: Console | None = None) 
             every = [path for paths in found.values() for path in paths]
             metres = count_m(options.maps, every, options.maps_kind, options.metres_per_count)
             about = {"maps": str(options.maps.absolute()), "kind": options.maps_kind, "along": options.maps_along}
-            maps = partial(_read, found, fisheyes, options.maps_along, metres)
-            _make(output, fisheyes, found, maps, options.maps_kind, {**about, "metres_per_count": metres}, console)
+
+            def read(picture: Path) -> list[Layer]:
+                maps = read_maps(found[picture], metres)
+                layers = [view.layer(each) for view, each in zip(fisheyes.views, maps, strict=True)]
+                along_ray = options.maps_along == "ray"
+                return [replace(each, cosine=np.ones_like(each.cosine)) if along_ray else each for each in layers]
+
+            _make(output, fisheyes, found, read, options.maps_kind, {**about, "metres_per_count": metres}, console)
         else:
             jobs = [partial(_cut, path, output, fisheyes) for path in fisheyes.pictures]
             run_jobs(jobs, "Cutting views", console)
@@ -186,17 +192,6 @@ def _maps_of(folder: Path, picture: Path, views: Sequence[PinholeView]) -> list[
     return [find_map(stem, stem.name, (view.width, view.height)) for stem, view in zip(stems, views, strict=True)]
 
 
-def _read(found: dict[Path, list[Path]], fisheyes: Fisheyes, along: Along, metres: float, picture: Path) -> list[Layer]:
-    maps = [read_map(path, metres) for path in found[picture]]
-    if all(np.isnan(each).all() for each in maps):
-        raise InputError(
-            f"{found[picture][0]}: neither this map nor one of the picture's other views contains a positive number. "
-            "Make them again, or take the picture away."
-        )
-    layers = [view.layer(each) for view, each in zip(fisheyes.views, maps, strict=True)]
-    return layers if along == "z" else [replace(each, cosine=np.ones_like(each.cosine)) for each in layers]
-
-
 def _make(
     output: Path,
     fisheyes: Fisheyes,
@@ -220,7 +215,7 @@ def _make(
             if kind == "metric":
                 write_distance_png(targets[path], distance)
             else:
-                write_atomically(targets[path], partial(_save, distance))
+                write_atomically(targets[path], partial(np.save, arr=distance))
     unit = "metres, 16-bit PNGs of 1/256 m" if kind == "metric" else "without a unit: each map's median is 1"
     say(console, f"{len(targets)} distance maps ({unit}): {output / DISTANCE}; to look at: {output / COLOURED}")
 
@@ -236,7 +231,3 @@ def joined(layers: Sequence[Layer], usable: Bool[np.ndarray, "h w"], kind: Kind)
         distance /= np.median(distance[distance > 0])
         farthest = FARTHEST
     return np.where(distance <= farthest, distance, 0).astype(np.float32)
-
-
-def _save(distance: Float32[np.ndarray, "h w"], path: Path) -> None:
-    np.save(path, distance)

@@ -10,17 +10,17 @@ forward).
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
+from pydantic import Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
 
 from edge_depth_nerf.base.errors import InputError
@@ -43,13 +43,15 @@ _INPUT_CHANNELS = 3 + _GEOMETRY_CHANNELS + 1
 class NetworkSettings:
     """What fixes a network's form and its units; kept in the weights' file."""
 
-    channels: tuple[int, ...]
+    channels: Annotated[
+        tuple[Annotated[int, Field(gt=0, le=1024, multiple_of=_GROUPS)], ...], Field(min_length=2, max_length=8)
+    ]
     """Features at a half, a quarter, an eighth … of the working size; multiples of 8."""
-    working_px: int
+    working_px: Annotated[int, Field(ge=16, le=4096)]
     """Longer side of the pictures it is shown; larger ones are averaged down to it."""
-    camera_height_m: float
+    camera_height_m: Annotated[float, Field(gt=0, lt=1e4)]
     """Height of the cameras above the ground, in the training drives; for drives without LiDAR."""
-    room_radius_m: float
+    room_radius_m: Annotated[float, Field(gt=0, lt=1e4)]
     """Horizontal distance that the room's wall has."""
 
     @property
@@ -171,7 +173,13 @@ def load_network(path: Path) -> tuple[DepthNetwork, dict[str, Any]]:
         InputError: the file is broken, or holds another architecture.
     """
     tensors, header = read_tensors(path)
-    settings = settings_from(header.get("settings"), path)
+    try:
+        settings = TypeAdapter(NetworkSettings).validate_json(json.dumps(header.get("settings")), strict=True)
+    except (ValidationError, RecursionError):
+        raise InputError(
+            f"{path}: its settings describe no network: {header.get('settings')}. Expected channels (multiples of "
+            f"{_GROUPS}), working_px, camera_height_m and room_radius_m. Train it again, without --model."
+        ) from None
     # without memory: settings may describe a network far larger than the file
     with torch.device("meta"):
         expected = {name: tuple(tensor.shape) for name, tensor in DepthNetwork(settings).state_dict().items()}
@@ -191,15 +199,6 @@ def load_network(path: Path) -> tuple[DepthNetwork, dict[str, Any]]:
     return network.eval(), dict(about) if isinstance(about, dict) else {}
 
 
-def weights_key(network: DepthNetwork) -> str:
-    """What tells one network's weights from another's."""
-    digest = hashlib.sha256()
-    for name, tensor in network.state_dict().items():
-        digest.update(f"{name}{tensor.dtype}{tuple(tensor.shape)}".encode())
-        digest.update(tensor.detach().cpu().contiguous().numpy().data)
-    return digest.hexdigest()[:32]
-
-
 def is_ours(path: Path) -> bool:
     """Whether this project wrote a file of tensors, of this or of another architecture."""
     from safetensors import SafetensorError, safe_open
@@ -209,31 +208,6 @@ def is_ours(path: Path) -> bool:
             return (file.metadata() or {}).get("architecture", "").startswith(_FAMILY)
     except (SafetensorError, OSError):
         return False
-
-
-def settings_from(found: Any, path: Path) -> NetworkSettings:
-    """Check settings that a file brings.
-
-    Raises:
-        InputError: they describe no network of bounded size.
-    """
-    found = found if isinstance(found, dict) else {}
-    channels, working_px = found.get("channels"), found.get("working_px")
-    lengths = [found.get("camera_height_m"), found.get("room_radius_m")]
-    fine = (
-        isinstance(channels, list)
-        and 2 <= len(channels) <= 8
-        and all(isinstance(count, int) and 0 < count <= 1024 and count % _GROUPS == 0 for count in channels)
-        and isinstance(working_px, int)
-        and 16 <= working_px <= 4096
-        and all(isinstance(length, float) and 0 < length < 1e4 for length in lengths)
-    )
-    if not fine:
-        raise InputError(
-            f"{path}: its settings describe no network: {found}. Expected channels (multiples of {_GROUPS}), "
-            "working_px, camera_height_m and room_radius_m. Train it again, without --model."
-        )
-    return NetworkSettings(tuple(channels), working_px, *lengths)  # pyrefly: ignore[bad-argument-type]
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:

@@ -61,17 +61,14 @@ class PinholeView:
         """The view's picture; black outside the lens."""
         return np.asarray(_read(picture, self.picture_xy), np.uint8)
 
-    def back(self, values: Float[np.ndarray, "height width"]) -> Float32[np.ndarray, "rows columns"]:
-        """A map of the view, of any scale of its own, read at the pixels of the box.
+    def layer(self, values: Float[np.ndarray, "height width"]) -> Layer:
+        """What a map of the view, of any scale of its own, says of the picture.
 
         NaN where the view sees nothing, and beside a value that is not finite.
         """
         found = _read(values.astype(np.float32), self.view_xy)
-        return np.where((self.weight > 0) & np.isfinite(found), found, np.float32(np.nan))
-
-    def layer(self, values: Float[np.ndarray, "height width"]) -> Layer:
-        """What a map of the view says of the picture."""
-        return Layer(self.box, self.back(values), self.cosine, self.weight)
+        found = np.where((self.weight > 0) & np.isfinite(found), found, np.float32(np.nan))
+        return Layer(self.box, found, self.cosine, self.weight)
 
 
 def _read(pixels: NDArray, at_xy: NDArray[np.float32]) -> NDArray:

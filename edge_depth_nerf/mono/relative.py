@@ -29,11 +29,6 @@ from edge_depth_nerf.method.alignment import robust_weights
 
 Kind = Literal["metric", "relative", "inverse"]
 
-KIND_SAID: dict[Kind, str] = {
-    "metric": "depth in metres",
-    "relative": "depth up to scale and shift, fitted to LiDAR",
-    "inverse": "disparity up to scale and shift, fitted to LiDAR",
-}
 ANCHOR_WEIGHT = 0.1
 """What views say already counts so much, where there is no LiDAR; that they agree counts 1."""
 WRONG_WAY = -0.5

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +24,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.mono.examples import Examples
+from edge_depth_nerf.mono.examples import Examples, fingerprint
 from edge_depth_nerf.mono.network import (
     DepthNetwork,
     NetworkSettings,
     distance_m,
     ray_geometry,
     read_tensors,
-    weights_key,
     write_tensors,
 )
 from edge_depth_nerf.mono.optimizer import HiddenMuon
@@ -73,19 +72,29 @@ class TrainingOptions:
 
 @dataclass
 class Trained:
-    """The outcome: the weights of the best look."""
+    """How far a training is; in the end with the weights of the best look."""
 
     network: DepthNetwork
-    steps: int
+    steps: int = 0
     """Steps taken."""
-    best_step: int
-    """The step that the weights are of."""
-    abs_rel: float
-    """Mean relative error on the pictures kept for stopping; NaN without any."""
-    seconds: float
+    best_step: int = 0
+    """The step of the best look, which the weights are of."""
+    abs_rel: float = math.inf
+    """Mean relative error on the pictures kept for stopping at the best look, infinite before the first; NaN without
+    any."""
+    seconds: float = 0.0
     """Wall time of all calls together."""
-    stopped_early: bool
+    stopped_early: bool = False
     """Whether it was stopped because nothing improved any more."""
+    looks_since_best: int = 0
+
+    def is_best(self, abs_rel: float) -> bool:
+        """Take note of a look; whether none before was as good."""
+        if not abs_rel < self.abs_rel:
+            self.looks_since_best += 1
+            return False
+        self.abs_rel, self.best_step, self.looks_since_best = abs_rel, self.steps, 0
+        return True
 
 
 @dataclass(frozen=True)
@@ -213,25 +222,13 @@ def _jittered(rgb: Tensor, strength: float, generator: np.random.Generator) -> T
 # ---- the loop --------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class _State:
-    """What a checkpoint holds beside tensors."""
-
-    step: int = 0
-    seconds: float = 0.0
-    best: float = math.inf
-    best_step: int = 0
-    looks_since_best: int = 0
-    finished: bool = False
-    identity: dict[str, Any] = field(default_factory=dict)
-
-    def is_best(self, error: float) -> bool:
-        """Take note of a look; whether none before was as good."""
-        if not error < self.best:
-            self.looks_since_best += 1
-            return False
-        self.best, self.best_step, self.looks_since_best = error, self.step, 0
-        return True
+def identity_of(
+    examples: Examples, settings: NetworkSettings, options: TrainingOptions, start: DepthNetwork | None
+) -> dict[str, Any]:
+    """What tells one training from another, as read back from JSON: tuples are lists."""
+    weights = {name: tensor.cpu().numpy() for name, tensor in start.state_dict().items()} if start else {}
+    prints = {"examples": fingerprint(vars(examples)), "start": fingerprint(weights) if start else None}
+    return json.loads(json.dumps({"training": asdict(options), "settings": asdict(settings), **prints}))
 
 
 def train(
@@ -243,16 +240,15 @@ def train(
     start: DepthNetwork | None = None,
     checkpoint: Path | None = None,
     checkpoint_seconds: float = 20.0,
-    device: torch.device | None = None,
     report: Callable[[float, float], None] = lambda share, abs_rel: None,
 ) -> Trained:
-    """Train a network, or resume an interrupted training; on the GPU if there is one and no other device is given.
+    """Train a network, or resume an interrupted training; on the GPU if there is one.
 
     `kept` are pictures kept for stopping, with LiDAR points; None to take the last weights. `start` has the same
     settings. A killed training resumes from its checkpoint; that of another one is replaced. `report` is called after
     each step with the share done and the least error so far, infinite before the first look.
     """
-    device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
         network = DepthNetwork(settings)
@@ -266,47 +262,35 @@ def train(
         hidden_learning_rate=options.hidden_learning_rate,
         weight_decay=options.weight_decay,
     )
-    best = _copied(network)
-    identity = {
-        "options": asdict(options),
-        "settings": asdict(settings),
-        "examples": examples.fingerprint(),
-        "start": None if start is None else weights_key(start),
-    }
-    state = _State(identity=as_json(identity))
+    trained, best = Trained(network), _copied(network)
+    identity = identity_of(examples, settings, options, start)
     if checkpoint is not None and checkpoint.is_file():
-        state = _resume(checkpoint, state, network, optimizer, best)
+        _resume(checkpoint, identity, trained, optimizer, best)
 
-    started = time.monotonic() - state.seconds
+    started = time.monotonic() - trained.seconds
     saved = time.monotonic()
     with _workers(device) as workers:
-        while not state.finished:
-            _step(network, optimizer, examples, settings, options, state, device, workers)
-            state.step += 1
-            state.seconds = time.monotonic() - started
-            share = _share(state, options)
-            state.finished = share >= 1.0
-            if kept is not None and (state.finished or state.step % options.evaluate_every == 0):
-                if state.is_best(abs_rel(network, kept, settings, device)):
+        while not trained.stopped_early and (share := _share(trained, options)) < 1.0:
+            _step(trained, share, optimizer, examples, options, device, workers)
+            trained.steps += 1
+            trained.seconds = time.monotonic() - started
+            share = _share(trained, options)
+            if kept is not None and (share >= 1.0 or trained.steps % options.evaluate_every == 0):
+                if trained.is_best(abs_rel(network, kept, device)):
                     best = _copied(network)
-                state.finished |= state.looks_since_best >= options.patience
-            if checkpoint is not None and (state.finished or time.monotonic() - saved >= checkpoint_seconds):
-                _save(checkpoint, state, network, optimizer, best)
+                trained.stopped_early = share < 1.0 and trained.looks_since_best >= options.patience
+            finished = share >= 1.0 or trained.stopped_early
+            if checkpoint is not None and (finished or time.monotonic() - saved >= checkpoint_seconds):
+                _save(checkpoint, identity, trained, optimizer, best)
                 saved = time.monotonic()
-            report(1.0 if state.finished else share, state.best)
+            report(1.0 if finished else share, trained.abs_rel)
 
     if kept is None:
-        state.best, state.best_step = math.nan, state.step
+        trained.abs_rel, trained.best_step = math.nan, trained.steps
     else:
         network.load_state_dict(best)
-    return Trained(
-        network=network.cpu().eval(),
-        steps=state.step,
-        best_step=state.best_step,
-        abs_rel=state.best,
-        seconds=state.seconds,
-        stopped_early=_share(state, options) < 1.0,
-    )
+    network.cpu().eval()
+    return trained
 
 
 @contextmanager
@@ -327,27 +311,22 @@ def _workers(device: torch.device) -> Iterator[ThreadPoolExecutor | None]:
     The network is so small that torch's own threads mostly wait for each other: two take half as much processor time
     again, and save an eighth of the time.
     """
-    threads = torch.get_num_threads()
-    if device.type != "cpu":
+    each = torch.get_num_threads() // 2
+    if device.type != "cpu" or each < 1:
         yield None
         return
-    each = max(threads // 2, 1)
-    with torch_threads(each):
-        if threads < 2:
-            yield None
-            return
-        with ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(each,)) as workers:
-            yield workers
+    with torch_threads(each), ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(each,)) as workers:
+        yield workers
 
 
 def _copied(network: DepthNetwork) -> dict[str, Tensor]:
     return {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
 
 
-def _share(state: _State, options: TrainingOptions) -> float:
+def _share(trained: Trained, options: TrainingOptions) -> float:
     """How much of the training is done: of its steps, or of its time."""
-    by_time = state.seconds / options.seconds if options.seconds else 0.0
-    return min(max(state.step / options.steps, by_time), 1.0)
+    by_time = trained.seconds / options.seconds if options.seconds else 0.0
+    return min(max(trained.steps / options.steps, by_time), 1.0)
 
 
 def _rate(share: float) -> float:
@@ -356,17 +335,16 @@ def _rate(share: float) -> float:
 
 
 def _step(
-    network: DepthNetwork,
+    trained: Trained,
+    share: float,
     optimizer: HiddenMuon,
     examples: Examples,
-    settings: NetworkSettings,
     options: TrainingOptions,
-    state: _State,
     device: torch.device,
     workers: ThreadPoolExecutor | None,
 ) -> None:
-    mapped = map if workers is None else workers.map
-    generator = np.random.default_rng([options.seed, state.step])
+    mapped, network, settings = map if workers is None else workers.map, trained.network, trained.network.settings
+    generator = np.random.default_rng([options.seed, trained.steps])
     indices = generator.choice(len(examples), min(options.batch, len(examples)), replace=False)
     batch = augmented(make_batch(examples, indices, settings, device), options, settings.multiple_px, generator)
     parameters = optimizer.parameters
@@ -375,7 +353,7 @@ def _step(
     for parameter, *gradients in zip(parameters, *found, strict=True):
         parameter.grad = functools.reduce(torch.add, gradients)
     torch.nn.utils.clip_grad_norm_(parameters, 1.0)
-    optimizer.step(_rate(_share(state, options)), mapped)
+    optimizer.step(_rate(share), mapped)
 
 
 def _losses(network: DepthNetwork, batch: Batch, options: TrainingOptions) -> list[Callable[[], Tensor]]:
@@ -414,11 +392,11 @@ def _loss(
 
 
 @torch.no_grad()
-def abs_rel(network: DepthNetwork, examples: Examples, settings: NetworkSettings, device: torch.device) -> float:
+def abs_rel(network: DepthNetwork, examples: Examples, device: torch.device) -> float:
     """Mean of |predicted - measured| / measured over all LiDAR points of the examples."""
     total, count = 0.0, 0
     for first in range(0, len(examples), 4):
-        batch = make_batch(examples, np.arange(first, min(first + 4, len(examples))), settings, device)
+        batch = make_batch(examples, np.arange(first, min(first + 4, len(examples))), network.settings, device)
         predicted_m = distance_m(network(batch.rgb, batch.geometry, batch.usable), batch.log_room)
         valid = (batch.lidar_m > 0) & batch.usable
         total += float(((predicted_m - batch.lidar_m).abs() / batch.lidar_m.clamp(min=1e-3))[valid].double().sum())
@@ -429,34 +407,34 @@ def abs_rel(network: DepthNetwork, examples: Examples, settings: NetworkSettings
 # ---- checkpoints -----------------------------------------------------------------------------------------------
 
 
-def _save(path: Path, state: _State, network: DepthNetwork, optimizer: HiddenMuon, best: dict[str, Tensor]) -> None:
-    tensors = {f"network/{name}": tensor for name, tensor in network.state_dict().items()}
+def _save(
+    path: Path, identity: dict[str, Any], trained: Trained, optimizer: HiddenMuon, best: dict[str, Tensor]
+) -> None:
+    tensors = {f"network/{name}": tensor for name, tensor in trained.network.state_dict().items()}
     tensors |= {f"best/{name}": tensor for name, tensor in best.items()}
     tensors |= {f"optimizer/{name}": tensor for name, tensor in optimizer.tensors()}
-    header: dict[str, Any] = asdict(state)
-    header["best"] = None if math.isinf(state.best) else state.best
-    write_tensors(path, tensors, header)
+    reached = {entry.name: getattr(trained, entry.name) for entry in fields(Trained) if entry.name != "network"}
+    # JSON has no infinity
+    reached["abs_rel"] = None if math.isinf(trained.abs_rel) else trained.abs_rel
+    write_tensors(path, tensors, {"identity": identity, "reached": reached})
 
 
-def _resume(path: Path, fresh: _State, network: DepthNetwork, optimizer: HiddenMuon, best: dict[str, Tensor]) -> _State:
-    """Load a checkpoint into network, optimizer and `best`; one of another training changes nothing."""
+def _resume(
+    path: Path, identity: dict[str, Any], trained: Trained, optimizer: HiddenMuon, best: dict[str, Tensor]
+) -> None:
+    """Load a checkpoint into all that `train` has; one of another training changes nothing."""
     try:
         tensors, header = read_tensors(path)
     except InputError:
-        return fresh
-    if header.get("identity") != fresh.identity:
-        return fresh
+        return
+    if header.get("identity") != identity:
+        return
     groups: dict[str, dict[str, Tensor]] = {"network": {}, "best": {}, "optimizer": {}}
     for name, tensor in tensors.items():
         kind, _, rest = name.partition("/")
         groups[kind][rest] = tensor
-    network.load_state_dict(groups["network"])
+    trained.network.load_state_dict(groups["network"])
     best.update(groups["best"])
     optimizer.load(groups["optimizer"])
-    header["best"] = math.inf if header["best"] is None else header["best"]
-    return _State(**header)
-
-
-def as_json(value: Any) -> Any:
-    """As read back from a file: tuples become lists."""
-    return json.loads(json.dumps(value))
+    for name, value in header["reached"].items():
+        setattr(trained, name, math.inf if value is None else value)

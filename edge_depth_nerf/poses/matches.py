@@ -12,6 +12,7 @@ clearly nearer than the second. Pixels have their centres at +0.5, camera axes a
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -36,8 +37,6 @@ LEAST_BASELINE_M = 0.05
 """Pictures taken nearer to each other have no epipolar plane to speak of."""
 LEAST_FROM_EPIPOLE_RAD = np.radians(3.0)
 """Rays nearer to the epipole than this see the plane turn about them."""
-INLIER_PX = 2.0
-"""A match that lies nearer to its curve than this agrees with the poses."""
 LEAST_MATCHES = 20
 """The median of fewer matches says nothing."""
 _BORDER_PX = 4
@@ -241,52 +240,31 @@ class EpipolarAgreement:
     """The earlier frame."""
     second: int
     """The later frame."""
-    matches: int
-    """How many matched features have an epipolar curve."""
     median_px: float
-    """Median of their distances from it; NaN for fewer than twenty."""
-    inliers: float
-    """Share that lies within 2 px; NaN likewise."""
+    """Median of the distances of matched features from their epipolar curves; NaN for fewer than twenty."""
 
 
-def successive(
-    pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MEASURED_FRAMES
-) -> list[tuple[int, int]]:
-    """Pairs of pictures of one camera, so many frames apart (1: the next), between which the vehicle moved; in order.
-
-    They begin at `most` frames of each camera, spread over the drive.
-    """
-    pairs = []
-    for camera in dict.fromkeys(picture.camera for picture in pictures):
-        ordered = sorted((p.frame, i) for i, p in enumerate(pictures) if p.camera == camera)
-        for start in spread_over(len(ordered), most):
-            for later in apart:
-                if start + later < len(ordered):
-                    first, second = ordered[start][1], ordered[start + later][1]
-                    between = pictures[second].camera_to_world[:3, 3] - pictures[first].camera_to_world[:3, 3]
-                    if np.linalg.norm(between) >= LEAST_BASELINE_M:
-                        pairs.append((first, second))
-    return pairs
-
-
-def along_drive(
-    pictures: Sequence[PosedPicture], apart: Sequence[int] = (1, 2), most: int = MEASURED_FRAMES
-) -> list[EpipolarAgreement]:
+def along_drive(pictures: Sequence[PosedPicture], most: int = MEASURED_FRAMES) -> list[EpipolarAgreement]:
     """Hold the poses of a drive against features matched between successive pictures of each camera, in any order.
 
-    There is one result for each pair between whose pictures the vehicle moved by 5 cm or more, by camera and frame;
-    pairs are chosen as by `successive`.
+    Pairs begin at `most` frames of each camera, spread over the drive. There is one result for each pair between whose
+    pictures the vehicle moved by 5 cm or more, by camera and frame.
 
     Raises:
         InputError: a picture or its mask cannot be read.
     """
+    pairs: list[tuple[int, int]] = []
+    for camera in dict.fromkeys(picture.camera for picture in pictures):
+        ordered = sorted((p.frame, i) for i, p in enumerate(pictures) if p.camera == camera)
+        steps = list(itertools.pairwise(index for _, index in ordered))
+        pairs += [steps[start] for start in spread_over(len(ordered), most) if start < len(steps)]
+    places = [picture.camera_to_world[:3, 3] for picture in pictures]
+    moved = [pair for pair in pairs if np.linalg.norm(places[pair[1]] - places[pair[0]]) >= LEAST_BASELINE_M]
     found = []
-    for matches in match_pictures(pictures, successive(pictures, apart, most)):
+    for matches in match_pictures(pictures, moved):
         first, second = pictures[matches.first], pictures[matches.second]
         distances_px = epipolar_distance_px(matches, first.camera_to_world, second.camera_to_world)
         known = distances_px[np.isfinite(distances_px)]
-        median_px = inliers = float("nan")
-        if len(known) >= LEAST_MATCHES:
-            median_px, inliers = float(np.median(known)), float((known < INLIER_PX).mean())
-        found.append(EpipolarAgreement(first.camera, first.frame, second.frame, len(known), median_px, inliers))
+        median_px = float(np.median(known)) if len(known) >= LEAST_MATCHES else float("nan")
+        found.append(EpipolarAgreement(first.camera, first.frame, second.frame, median_px))
     return found

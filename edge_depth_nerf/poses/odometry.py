@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -67,14 +68,14 @@ class TimedSweep:
 
 
 def import_kiss_icp() -> Any:
-    """KISS-ICP's parts that are used here.
+    """KISS-ICP's package, with its parts that are used here.
 
     Raises:
         InputError: it is not installed, or too old.
     """
     try:
         import kiss_icp
-        from kiss_icp import config, mapping, registration, threshold, voxelization
+        from kiss_icp import config, mapping, registration, threshold, voxelization  # noqa: F401
     except ImportError as error:
         raise InputError(
             f"--poses lidar: needs KISS-ICP's Python package, which cannot be imported ({error}). Install it with "
@@ -85,7 +86,7 @@ def import_kiss_icp() -> Any:
             f"--poses lidar: kiss-icp {kiss_icp.__version__} is too old, expected 1.2 or newer. Install it with "
             f"`{INSTALL}`."
         )
-    return _Kiss(config.KISSConfig, mapping, registration, threshold, voxelization.voxel_down_sample)
+    return kiss_icp
 
 
 def odometry(sweeps: Sequence[TimedSweep], advance: Callable[[], object] = lambda: None) -> Trajectory:
@@ -118,52 +119,38 @@ def steps_of(sweeps: int) -> int:
     return 2 * min(sweeps, _SEED_SWEEPS) + (1 + _ROUNDS) * sweeps
 
 
-@dataclass(frozen=True)
-class _Kiss:
-    """KISS-ICP's modules."""
-
-    config: Any
-    mapping: Any
-    registration: Any
-    threshold: Any
-    thin: Callable[[np.ndarray, float], np.ndarray]
-    """Keep one point of each cube of a size."""
-
-    def parts(self, voxel_m: float, settled: float) -> tuple[Callable[[], Any], Any, Any]:
-        """What makes a map, what lays a sweep on it until it settles, and what says how far off the sweep may lie."""
-        config = self.config()
-        config.data.max_range = RANGE_M[1]
-        config.mapping.voxel_size = voxel_m
-        config.registration.convergence_criterion = settled
-        # threads would add numbers up in another order each time
-        config.registration.max_num_threads = 1
-        registration, threshold = self.registration.get_registration(config), self.threshold
-        return (
-            lambda: self.mapping.get_voxel_hash_map(config),
-            registration.align_points_to_map,
-            threshold.get_threshold_estimator(config),
-        )
+def _parts(kiss: Any, voxel_m: float, settled: float) -> tuple[Callable[[], Any], Any, Any]:
+    """What makes a map, what lays a sweep on it until it settles, and what says how far off the sweep may lie."""
+    config = kiss.config.KISSConfig()
+    config.data.max_range = RANGE_M[1]
+    config.mapping.voxel_size = voxel_m
+    config.registration.convergence_criterion = settled
+    # threads would add numbers up in another order each time
+    config.registration.max_num_threads = 1
+    lay, threshold = kiss.registration.get_registration(config).align_points_to_map, kiss.threshold
+    return partial(kiss.mapping.get_voxel_hash_map, config), lay, threshold.get_threshold_estimator(config)
 
 
 def _follow(
-    kiss: _Kiss, sweeps: Sequence[TimedSweep], start: Trajectory | None, advance: Callable[[], object]
+    kiss: Any, sweeps: Sequence[TimedSweep], start: Trajectory | None, advance: Callable[[], object]
 ) -> Float64[np.ndarray, "sweeps 4 4"]:
     """Lay each sweep on a map of those before it, in the order given, forwards or backwards in time.
 
     `start` is the motion that the first sweep is taken in, None = not known; `advance` is called for each sweep.
     """
-    new_map, lay, threshold = kiss.parts(_VOXEL_M, _SETTLED)
+    new_map, lay, threshold = _parts(kiss, _VOXEL_M, _SETTLED)
+    thin = kiss.voxelization.voxel_down_sample
     known, poses = new_map(), [np.eye(4)]
     for index, sweep in enumerate(sweeps):
         motion = start if index < 2 else _last_step(sweeps[:index], poses)
-        points = kiss.thin(_in_vehicle(sweep, motion), 0.5 * _VOXEL_M)
+        points = thin(_in_vehicle(sweep, motion), 0.5 * _VOXEL_M)
         if index:
             guess = poses[-1]
             if motion is not None:
                 before, now = motion.at(np.array([sweeps[index - 1].time_s, sweep.time_s]))
                 guess = guess @ np.linalg.inv(before) @ now
             sigma = threshold.get_threshold()
-            poses.append(lay(kiss.thin(points, 1.5 * _VOXEL_M), known, guess, 3 * sigma, sigma))
+            poses.append(lay(thin(points, 1.5 * _VOXEL_M), known, guess, 3 * sigma, sigma))
             threshold.update_model_deviation(np.linalg.inv(guess) @ poses[-1])
         known.update(points, poses[-1])
         advance()
@@ -188,10 +175,11 @@ def _in_vehicle(sweep: TimedSweep, path: Trajectory | None) -> Float64[np.ndarra
 
 
 def _among_neighbours(
-    kiss: _Kiss, sweeps: Sequence[TimedSweep], path: Trajectory, advance: Callable[[], object]
+    kiss: Any, sweeps: Sequence[TimedSweep], path: Trajectory, advance: Callable[[], object]
 ) -> Trajectory:
     """Correct each sweep by a path, and lay it on a map of its neighbours; those before it have been laid already."""
-    new_map, lay, _ = kiss.parts(_FINE_VOXEL_M, _FINE_SETTLED)
+    new_map, lay, _ = _parts(kiss, _FINE_VOXEL_M, _FINE_SETTLED)
+    thin = kiss.voxelization.voxel_down_sample
     poses = path.vehicle_to_world.copy()
     clouds: dict[int, np.ndarray] = {}
     for index in range(len(sweeps)):
@@ -200,14 +188,14 @@ def _among_neighbours(
         around = range(first, min(first + 2 * _NEIGHBOURS + 1, len(sweeps)))
         for other in around:
             if other not in clouds:
-                clouds[other] = kiss.thin(_in_vehicle(sweeps[other], path), _FINE_M)
+                clouds[other] = thin(_in_vehicle(sweeps[other], path), _FINE_M)
         clouds.pop(first - 1, None)
         known = new_map()
         # a full cube of the map takes no more points: the nearest in time come first
         for other in sorted(around, key=lambda other: abs(other - index)):
             if other != index:
                 known.add_points(clouds[other] @ poses[other, :3, :3].T + poses[other, :3, 3])
-        source = kiss.thin(clouds[index], _FINE_VOXEL_M)
+        source = thin(clouds[index], _FINE_VOXEL_M)
         poses[index] = lay(source, known, poses[index], 3 * _FINE_SIGMA_M, _FINE_SIGMA_M)
         advance()
     return Trajectory(path.times_s, poses)

@@ -34,7 +34,7 @@ def features_say(recording: Recording, options: ProcessOptions, console: Console
     posed = posed_pictures(recording, masks, lambda picture, _: read_image(picture.path))
     with console.status("Comparing the poses with features of the pictures"):
         try:
-            found = [pair for pair in along_drive(posed, apart=(1,)) if np.isfinite(pair.median_px)]
+            found = [pair for pair in along_drive(posed) if np.isfinite(pair.median_px)]
         except (InputError, FileNotFoundError) as error:
             if options.strict:
                 raise

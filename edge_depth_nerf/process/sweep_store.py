@@ -166,7 +166,7 @@ class Scanner:
         for other in filter(self.readable, self.around(index)):
             free_space = self._loaded.get(other).free_space
             assert free_space is not None
-            passed |= free_space.seen_through(world.points_m)
+            passed |= free_space.observed(world.points_m)[0]
         return passed
 
     def own(self, frame: int, time_s: float) -> int | None:

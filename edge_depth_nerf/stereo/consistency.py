@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32
 
 from edge_depth_nerf.lidar.projection import project_points
 from edge_depth_nerf.masks.regions import larger
-from edge_depth_nerf.stereo.sweep import Geometry, Swept, padded, rays_of
+from edge_depth_nerf.stereo.sweep import Swept, geometry_of, padded, rays_of
 from edge_depth_nerf.stereo.views import View
 
 LEAST_PARALLAX_PX = 2.0
@@ -97,7 +97,7 @@ def confirm(
     largest = tuple(max(each.shape[axis] for each in theirs) for axis in (0, 1))
     sphere_sweep.compare(
         *(rays_of(view), inverse_per_m, unsure, np.stack([padded(each, largest, 0.0) for each in theirs])),
-        *Geometry.of(view, neighbours).transforms,
+        *geometry_of(view, neighbours)[1],
         *(np.float32(SAME_SHARE), agree, against, mean),
     )
     constant, of_margin, of_agreeing = _CONFIDENCE

@@ -31,7 +31,7 @@ _compiled = compiled(fastmath={"contract"}, error_model="numpy")
 
 @_compiled
 @no_type_check
-def _project_row(rays, inverses_per_m, turn, shift, factors, numbers, work, u, v, length):
+def _project_row(rays, inverses_per_m, turn, shift, factors, numbers, work):
     """Project points on a row of rays into another picture, by its `ProjectionSeries`.
 
     Args:
@@ -41,12 +41,11 @@ def _project_row(rays, inverses_per_m, turn, shift, factors, numbers, work, u, v
         shift: [3] this camera's centre in the other's axes, metres.
         factors: of the series.
         numbers: of the series.
-        work: [5, n] working space.
-        u: [n] gets the column, counted from the first pixel's centre, -1 where the picture does not reach.
-        v: [n] gets the row.
-        length: [n] gets the distance from the other camera over that from this one.
+        work: [8 or more, n] working space. Its row 5 gets the column, counted from the first pixel's centre, -1 where
+            the picture does not reach; row 6 the row; row 7 the distance from the other camera over that from this one.
     """
     x, y, place, radial, plain = work[0], work[1], work[2], work[3], work[4]
+    u, v, length = work[5], work[6], work[7]
     p1, p2, least, per_cosine = numbers[4], numbers[5], numbers[6], numbers[7]
     for j in range(len(u)):
         near = inverses_per_m[j]
@@ -144,21 +143,16 @@ def _window_statistics(picture, noise, mean, inverse_deviation):
 
 @_compiled
 @no_type_check
-def _put_in_order(greater, less):
-    for j in range(len(greater)):
-        a, b = greater[j], less[j]
-        greater[j] = a if a > b else b
-        less[j] = b if a > b else a
-
-
-@_compiled
-@no_type_check
 def _best_half_row(found, count, total, cost):
     """Average the greater half of each column of `found`, of those that are seen; `found` is put in order."""
     neighbours = len(found)
     for last in range(neighbours - 1, 0, -1):
         for n in range(last):
-            _put_in_order(found[n], found[n + 1])
+            greater, less = found[n], found[n + 1]
+            for j in range(len(cost)):
+                a, b = greater[j], less[j]
+                greater[j] = a if a > b else b
+                less[j] = b if a > b else a
     for j in range(len(cost)):
         count[j], total[j] = _ZERO, _ZERO
     for n in range(neighbours):
@@ -210,10 +204,7 @@ def sweep(reference, pictures, rays, spans, turns, shifts, factors, numbers, inv
                 if last - first < _SIDE:
                     continue
                 part = work[:, first:last]
-                _project_row(
-                    *(rays[:, i, first:last], part[9], turns[n], shifts[n], factors[n], numbers[n]),
-                    *(part[:5], part[5], part[6], part[7]),
-                )
+                _project_row(rays[:, i, first:last], part[9], turns[n], shifts[n], factors[n], numbers[n], part)
                 _sample_row(pictures[n], part[5], part[6], part[8])
                 row = sums[n, :, ring, first:last]
                 _sum_windows_along(reference[i, first:last], part[8], row[0], row[1], row[2])
@@ -258,13 +249,6 @@ def _least(row):
 
 @_compiled
 @no_type_check
-def _add(into, row):
-    for d in range(len(into)):
-        into[d] += row[d]
-
-
-@_compiled
-@no_type_check
 def _take_paths(cost, picture, small, large, edge, i, direction, rows, leasts, total):
     """Take the four paths that come to the pixels of a row from one side, and add them to `total` [w, hypotheses]."""
     height, width = picture.shape
@@ -291,7 +275,9 @@ def _take_paths(cost, picture, small, large, edge, i, direction, rows, leasts, t
             else:
                 after[1 : count + 1] = cost[j]
             least_here[path, j] = _least(after[1 : count + 1])
-            _add(total[j], after[1 : count + 1])
+            here_total = total[j]
+            for d in range(count):
+                here_total[d] += after[d + 1]
 
 
 @_compiled
@@ -378,10 +364,7 @@ def parallax(rays, inverses_per_m, pictures, turns, shifts, factors, numbers, an
         offset = turns[n].T.copy() @ shifts[n]
         square = offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2]
         for i in range(height):
-            _project_row(
-                *(rays[:, i], inverses_per_m[i], turns[n], shifts[n], factors[n], numbers[n]),
-                *(work[:5], work[5], work[6], work[7]),
-            )
+            _project_row(rays[:, i], inverses_per_m[i], turns[n], shifts[n], factors[n], numbers[n], work)
             _sample_row(pictures[n], work[5], work[6], work[8])
             for j in range(width):
                 if work[8, j] == work[8, j]:
@@ -408,10 +391,7 @@ def compare(rays, inverses_per_m, unsure, theirs, turns, shifts, factors, number
     for n in range(len(turns)):
         last_row, last_column = theirs[n].shape[0] - 1, theirs[n].shape[1] - 1
         for i in range(height):
-            _project_row(
-                *(rays[:, i], inverses_per_m[i], turns[n], shifts[n], factors[n], numbers[n]),
-                *(work[:5], work[5], work[6], work[7]),
-            )
+            _project_row(rays[:, i], inverses_per_m[i], turns[n], shifts[n], factors[n], numbers[n], work)
             for j in range(width):
                 here = inverses_per_m[i, j]
                 u, v = work[5, j] + _HALF, work[6, j] + _HALF

@@ -60,38 +60,24 @@ class Swept:
     middle; 0 where nobody sees it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Geometry:
-    """A view and its neighbours as the compiled loops want them."""
+def geometry_of(
+    view: View, neighbours: Sequence[View]
+) -> tuple[Float32[np.ndarray, "n h w"], tuple[NDArray[np.float32], ...]]:
+    """The neighbours as the compiled loops want them: their pictures, and all that projects the view's points.
 
-    pictures: Float32[np.ndarray, "n h w"]
-    turns: Float32[np.ndarray, "n 3 3"]
-    """From the view's axes to the neighbours'."""
-    shifts: Float32[np.ndarray, "n 3"]
-    """The view's centre in the neighbours' axes, metres."""
-    factors: Float32[np.ndarray, "n 2 length"]
-    numbers: Float32[np.ndarray, "n 8"]
-
-    @staticmethod
-    def of(view: View, neighbours: Sequence[View]) -> Geometry:
-        """Gather it."""
-        size = tuple(max(each.grey.shape[axis] for each in neighbours) for axis in (0, 1))
-        relative = [np.linalg.inv(each.camera_to_world) @ view.camera_to_world for each in neighbours]
-        series = [projection_series(each.camera, each.theta_max_rad) for each in neighbours]
-        length = max(each.factors.shape[1] for each in series)
-        return Geometry(
-            np.stack([padded(each.grey, size, np.nan) for each in neighbours]),
-            np.stack([transform[:3, :3] for transform in relative]).astype(np.float32),
-            np.stack([transform[:3, 3] for transform in relative]).astype(np.float32),
-            # the highest powers come first
-            np.stack([np.pad(each.factors, ((0, 0), (length - each.factors.shape[1], 0))) for each in series]),
-            np.stack([each.numbers for each in series]),
-        )
-
-    @property
-    def transforms(self) -> tuple[NDArray[np.float32], ...]:
-        """All but the pictures, in the loops' order."""
-        return self.turns, self.shifts, self.factors, self.numbers
+    That is: n×3×3 from the view's axes to the neighbours', n×3 the view's centre in these (metres), and n×2×length and
+    n×8 the factors and numbers of their projection series.
+    """
+    size = tuple(max(each.grey.shape[axis] for each in neighbours) for axis in (0, 1))
+    relative = np.stack([np.linalg.inv(each.camera_to_world) @ view.camera_to_world for each in neighbours])
+    relative = relative.astype(np.float32)
+    series = [projection_series(each.camera, each.theta_max_rad) for each in neighbours]
+    length = max(each.factors.shape[1] for each in series)
+    # the highest powers come first
+    factors = [np.pad(each.factors, ((0, 0), (length - each.factors.shape[1], 0))) for each in series]
+    turns, shifts = np.ascontiguousarray(relative[:, :3, :3]), np.ascontiguousarray(relative[:, :3, 3])
+    pictures = np.stack([padded(each.grey, size, np.nan) for each in neighbours])
+    return pictures, (turns, shifts, np.stack(factors), np.stack([each.numbers for each in series]))
 
 
 def padded(values: Float32[np.ndarray, "h w"], size: tuple[int, ...], by: float) -> Float32[np.ndarray, "H W"]:
@@ -117,10 +103,10 @@ def sweep_view(view: View, neighbours: Sequence[View]) -> Swept:
     from edge_depth_nerf.stereo import sphere_sweep
 
     height, width = view.grey.shape
-    geometry, directions = Geometry.of(view, neighbours), rays_of(view)
+    (pictures, transforms), directions = geometry_of(view, neighbours), rays_of(view)
     cost = np.empty((height, len(inverses_per_m), width), np.float32)
     sphere_sweep.sweep(
-        *(view.grey, geometry.pictures, directions, _spans(view), *geometry.transforms),
+        *(view.grey, pictures, directions, _spans(view), *transforms),
         *(inverses_per_m, np.float32(NOISE_LEVELS**2), cost),
     )
     total = np.empty((height, width, len(inverses_per_m)), np.float32)
@@ -131,7 +117,7 @@ def sweep_view(view: View, neighbours: Sequence[View]) -> Swept:
         *(total, cost, view.grey, inverses_per_m, _APART), *(found.inverse_per_m, found.correlation, found.margin)
     )
     angle = found.parallax_px
-    sphere_sweep.parallax(directions, found.inverse_per_m, geometry.pictures, *geometry.transforms, angle)
+    sphere_sweep.parallax(directions, found.inverse_per_m, pictures, *transforms, angle)
     angle *= np.float32(view.focal_px)
     return found
 

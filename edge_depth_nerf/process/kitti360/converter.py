@@ -26,7 +26,8 @@ import numpy as np
 
 from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.base.files import read_json
-from edge_depth_nerf.lidar import SweepTiming, check_sweep_size, read_sweep
+from edge_depth_nerf.lidar import SweepTiming
+from edge_depth_nerf.lidar.scans import ScanFormat, check_scan, read_scan
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.kitti360.calibration import read_poses, read_rig
 from edge_depth_nerf.process.options import Kitti360Options
@@ -60,7 +61,7 @@ def read_kitti360(options: Kitti360Options) -> Recording:
     whole = set()
     for number in numbers.tolist():
         with tolerance.of(number, SCANNER):
-            check_sweep_size(drive.sweep_file(number))
+            check_scan(drive.sweep_file(number), ScanFormat())
             whole.add(number)
     # a frame needs a sweep of its own
     kept = [(name, frame) for name, frame in kept if frame in whole]
@@ -84,7 +85,7 @@ def read_kitti360(options: Kitti360Options) -> Recording:
             frame=number,
             scanner=SCANNER,
             to_vehicle=velo_to_pose,
-            read=partial(read_sweep, drive.sweep_file(number)),
+            read=partial(read_scan, drive.sweep_file(number), ScanFormat()),
             timing=timing,
         )
         for number in near(np.array(sorted(whole)), np.array(frames)).tolist()
