@@ -459,6 +459,19 @@ def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDA
     return found
 
 
+def pcd_bytes(rows: NDArray) -> bytes:
+    """Encode points as a binary PCD file. The fields of `rows` are those of the file, in their order."""
+    names = rows.dtype.names or ()
+    kinds = [rows.dtype[name] for name in names]
+    header = (
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {' '.join(names)}\n"
+        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}\nTYPE {' '.join(kind.kind.upper() for kind in kinds)}\n"
+        f"COUNT {' '.join('1' for _ in kinds)}\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {len(rows)}\nDATA binary\n"
+    )
+    return header.encode() + rows.tobytes()
+
+
 def open_folder(output: Path, record_path: Path, record: dict[str, Any], what: str) -> None:
     """Begin a folder that one command writes, or continue one with the same record of what it is made of.
 
@@ -473,7 +486,8 @@ def open_folder(output: Path, record_path: Path, record: dict[str, Any], what: s
             raise InputError(
                 f"{output}: holds other {what} ({differing[0]} differs). Give another --output, or delete that folder."
             )
-    elif output.is_dir() and any(output.iterdir()):
-        raise InputError(f"{output}: holds something else. Give another --output, or empty that folder.")
+    elif output.is_dir() and (names := sorted(entry.name for entry in output.iterdir())):
+        some = f"{', '.join(names[:5])}{', …' if len(names) > 5 else ''}"
+        raise InputError(f"{output}: holds something else ({some}). Give another --output, or empty that folder.")
     else:
         write_json(record_path, record)
