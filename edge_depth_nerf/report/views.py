@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,7 +33,7 @@ from edge_depth_nerf.base.pictures import (
 )
 from edge_depth_nerf.masks.regions import from_nearest
 from edge_depth_nerf.report.compared_views import ComparedView, compared_view, held_out_frames
-from edge_depth_nerf.report.points import MOST_POINTS, ShownPoints, show_points
+from edge_depth_nerf.report.points import MOST_POINTS, show_points
 from edge_depth_nerf.report.tables import Metric
 from edge_depth_nerf.scene.reader import read_scene
 
@@ -113,7 +114,8 @@ class ShownDrive:
     views: Sequence[ShownView]
     note: str
     """Which views these are, and what their ground truth is."""
-    points: ShownPoints | None = None
+    points: dict[str, Any] | None = None
+    """What `show_points` gives."""
 
 
 def views_of_a_drive(runs: int) -> int:
@@ -149,7 +151,7 @@ def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: 
     ]
 
 
-def _points(scene: Path, most: int, console: Console) -> ShownPoints | None:
+def _points(scene: Path, most: int, console: Console) -> dict[str, Any] | None:
     """Return the drive's points. If they cannot be read, the page only lacks its view in 3D."""
     try:
         return show_points(read_scene(scene), most)
