@@ -18,7 +18,7 @@ import time
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -185,13 +185,20 @@ def read_json_object(path: Path, *keys: str) -> dict[str, Any]:
     return content
 
 
+def encoded(suffix: str, image: NDArray, options: Sequence[int] = ()) -> bytes:
+    """Encode H×W×3 RGB, H×W×4 RGBA or H×W in the format of a suffix, with OpenCV's options."""
+    pixels = np.ascontiguousarray(image)
+    if image.ndim == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
+    ok, content = cv2.imencode(suffix, pixels, options)
+    if not ok:
+        raise RuntimeError(f"{suffix}: encoding failed for {image.dtype} {image.shape}")
+    return content.tobytes()
+
+
 def write_png(path: Path, image: NDArray) -> None:
     """Write H×W×3 uint8 RGB, H×W uint8 or H×W uint16 as PNG, atomically."""
-    pixels = image[..., ::-1] if image.ndim == 3 else image
-    ok, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 4])
-    if not ok:
-        raise RuntimeError(f"{path}: PNG encoding failed for {image.dtype} {image.shape}")
-    write_bytes(path, encoded.tobytes())
+    write_bytes(path, encoded(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 4]))
 
 
 class PictureHead(NamedTuple):

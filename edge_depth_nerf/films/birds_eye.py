@@ -11,7 +11,6 @@ import shutil
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 from rich.console import Console
@@ -20,6 +19,7 @@ from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import in_turn, say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import (
+    encoded,
     open_folder,
     read_npz,
     remove_leftovers,
@@ -138,10 +138,7 @@ def _put_together(output: Path, tiles: list[Tile], plan: GroundPlan, offset_m: n
         arrays = read_npz(_tile_path(output, tile), ("colours", "height_m"), 4 * TILE_PX**2)
         colours[tile.slices], height_m[tile.slices] = arrays["colours"], arrays["height_m"]
     height_m += np.float32(offset_m[2])
-    for name, pixels in ((HEIGHT, height_m), (PICTURE, cv2.cvtColor(colours, cv2.COLOR_RGBA2BGRA))):
+    for name, pixels in ((HEIGHT, height_m), (PICTURE, colours)):
         suffix = Path(name).suffix
         write_text(output / name.replace(suffix, f"{suffix[:2]}{suffix[-1]}w"), plan.world_file(offset_m))
-        ok, encoded = cv2.imencode(suffix, pixels)
-        if not ok:
-            raise RuntimeError(f"{output / name}: encoding failed")
-        write_bytes(output / name, encoded.tobytes())
+        write_bytes(output / name, encoded(suffix, pixels))

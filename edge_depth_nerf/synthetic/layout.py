@@ -85,8 +85,8 @@ class DriveLayout(ABC):
 
         `paths` says where the files of a frame lie, by what they hold. With {name}, the camera's: `picture`, `mono`,
         `truth_distance`, `truth_rgb`, and `moving_mask`, where a picture shows nothing that moves; and of held-out
-        frames the truth as seen from so many metres to the car's left, `shifted_1_distance` and so on. Without: `scan`,
-        and `true_points`, the same without noise, moved to the frame's time.
+        frames ground truth as seen from so many metres to the car's left, `shifted_1_distance` and so on. Without:
+        `scan`, and `true_points`, the same without noise, moved to the frame's time.
         """
         self.options, self.root, self.cameras = options, options.output, cameras
         still = options.scene != "traffic"

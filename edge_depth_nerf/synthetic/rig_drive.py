@@ -98,11 +98,6 @@ def _filled(camera: Camera, theta_deg: float) -> Camera:
     return replace(camera, fx=focal, fy=1.001 * focal)
 
 
-def _scanner_to_vehicle(yaw_deg: float, position_m: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Scanner to vehicle, 4×4."""
-    return rigid(Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix(), position_m)
-
-
 class _RigFileLayout(DriveLayout):
     """What the layouts share that bring a rig file."""
 
@@ -140,7 +135,9 @@ class _Rig(_RigFileLayout):
     """The layout `rig`."""
 
     first_s = FIRST_NS / 1e9
-    scanner_to_vehicle = _scanner_to_vehicle(3.0, (0.8, 0.02, 0.84))
+    scanner_to_vehicle: NDArray[np.float64] = rigid(
+        Rotation.from_euler("z", 3.0, degrees=True).as_matrix(), (0.8, 0.02, 0.84)
+    )
     scanner = Scanner.turning(12.0, -26.0, 48, 1200, VEHICLE_TO_POSE @ scanner_to_vehicle)
 
     def __init__(self, options: SynthesizeOptions) -> None:
@@ -187,7 +184,7 @@ class _Rig(_RigFileLayout):
 class _JbnuDepth360(_RigFileLayout):
     """The layout `jbnu-depth360`."""
 
-    scanner_to_vehicle = _scanner_to_vehicle(0.0, (0.4, 0.0, 1.2))
+    scanner_to_vehicle: NDArray[np.float64] = rigid(np.eye(3), (0.4, 0.0, 1.2))
     scanner = Scanner.turning(45.0, -45.0, 32, 1024, VEHICLE_TO_POSE @ scanner_to_vehicle)
 
     def __init__(self, options: SynthesizeOptions) -> None:
