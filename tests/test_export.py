@@ -446,7 +446,7 @@ def test_other_options_or_another_state_of_the_scene_are_another_export(tmp_path
 def test_a_folder_with_something_else_is_refused(scene, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/notes.txt").write_text("mine")
-    with pytest.raises(InputError, match=r"mine: holds something else \(.+\)\. Give another --output"):
+    with pytest.raises(InputError, match=r"mine: holds something else \(\S+\)\. Give another --output"):
         export(scene, tmp_path / "mine")
     with pytest.raises(InputError, match=r"notes\.txt: is a file"):
         export(scene, tmp_path / "mine/notes.txt")

@@ -35,18 +35,6 @@ class _Screws:
     """The translation's part of log(T0⁻¹·T1)."""
 
 
-def check_times(times_s: Float64[np.ndarray, "poses"], of: str = "pose") -> None:
-    """Raise an InputError unless there are two times or more, and they increase."""
-    if len(times_s) < 2:
-        raise InputError(f"a path needs at least two {of}s for the vehicle's motion, found {len(times_s)}.")
-    if not (np.diff(times_s) > 0).all():
-        first = int(np.argmax(~(np.diff(times_s) > 0)))
-        raise InputError(
-            f"the times of a path must increase, but {of} {first + 2} is of {times_s[first + 1]:.6f} s, the one before "
-            f"of {times_s[first]:.6f} s."
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Poses of a vehicle over time.
@@ -130,3 +118,15 @@ class Trajectory:
         start = torch.from_numpy(self.vehicle_to_world)
         rotation, position = start[:, :3, :3][index], start[:, :3, 3][index]
         return (rotation @ moved[:, :, None]).squeeze(-1) + position
+
+
+def check_times(times_s: Float64[np.ndarray, "poses"], of: str = "pose") -> None:
+    """Raise an InputError unless there are two times or more, and they increase."""
+    if len(times_s) < 2:
+        raise InputError(f"a path needs at least two {of}s for the vehicle's motion, found {len(times_s)}.")
+    if not (np.diff(times_s) > 0).all():
+        first = int(np.argmax(~(np.diff(times_s) > 0)))
+        raise InputError(
+            f"the times of a path must increase, but {of} {first + 2} is of {times_s[first + 1]:.6f} s, the one before "
+            f"of {times_s[first]:.6f} s."
+        )
