@@ -16,9 +16,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.compare.options import CompareOptions, GridOptions, SearchOptions
 from edge_depth_nerf.demo.options import DemoOptions
 from edge_depth_nerf.export.options import ExportOptions
-from edge_depth_nerf.films.birds_eye_options import BirdsEyeOptions
-from edge_depth_nerf.films.options import CameraPathOptions
-from edge_depth_nerf.films.scan_options import RenderLidarOptions
+from edge_depth_nerf.films.options import BirdsEyeOptions, CameraPathOptions, RenderLidarOptions
 from edge_depth_nerf.inspecting.options import InspectOptions
 from edge_depth_nerf.mono.options import EstimateDepthOptions, FisheyeDepthOptions
 from edge_depth_nerf.plugin.compat import join_lines_of_option_help

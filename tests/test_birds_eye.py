@@ -17,8 +17,8 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.films import birds_eye
 from edge_depth_nerf.films.birds_eye import render_birds_eye
-from edge_depth_nerf.films.birds_eye_options import BirdsEyeOptions
 from edge_depth_nerf.films.ground_plan import GroundPlan, driven_path
+from edge_depth_nerf.films.options import BirdsEyeOptions
 from edge_depth_nerf.plugin.scanning import Caster, SceneToModel
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import Kitti360Options

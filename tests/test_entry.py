@@ -195,13 +195,13 @@ def work():
 def test_ctrl_c_at_work_leaves_whole_files(tmp_path):
     code = """
 import edge_depth_nerf.synthetic.drive as drive
-shown = drive.shown
+in_turn = drive.in_turn
 def told(*arguments):
-    for number, job in enumerate(shown(*arguments)):
+    for number, job in enumerate(in_turn(*arguments)):
         if number == 4:
             print("go", flush=True)
         yield job
-drive.shown = told
+drive.in_turn = told
 sys.argv = [*WORDS, "12"]
 main()
 """

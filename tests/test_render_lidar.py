@@ -23,9 +23,9 @@ from edge_depth_nerf.base.files import read_json, write_json
 from edge_depth_nerf.base.pictures import NO_VALUE_RGB
 from edge_depth_nerf.films import scan_command
 from edge_depth_nerf.films.intensities import Intensities
+from edge_depth_nerf.films.options import RenderLidarOptions
 from edge_depth_nerf.films.scan_command import render_lidar
 from edge_depth_nerf.films.scan_film import SIZE_PX, draw_scan
-from edge_depth_nerf.films.scan_options import RenderLidarOptions
 from edge_depth_nerf.films.scanning import RayDrop
 from edge_depth_nerf.lidar.patterns import ScanPattern
 from edge_depth_nerf.lidar.roughness import roughness

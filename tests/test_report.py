@@ -33,7 +33,7 @@ from edge_depth_nerf.process.options import Kitti360Options
 from edge_depth_nerf.report import views
 from edge_depth_nerf.report.build import Commands, Facts, Plot, Report, write_report
 from edge_depth_nerf.report.compared_views import BY_VIEW, DISTANCE_KEYS, ComparedView, held_out_frames
-from edge_depth_nerf.report.points import ShownPoints, show_points
+from edge_depth_nerf.report.points import show_points
 from edge_depth_nerf.report.tables import Cell, MadeTable, Row
 from edge_depth_nerf.report.views import KINDS, ShownDrive, ShownView, encode, make_drives, show_view, spread
 from edge_depth_nerf.scene.reader import read_scene
@@ -187,6 +187,12 @@ def test_views_come_in_the_order_of_the_evaluation(tmp_path):
 
 
 # --- points -----------------------------------------------------------------------------------------------------------
+def places_and_colours(points: dict[str, Any]) -> list[np.ndarray]:
+    """Places in steps, and colours."""
+    kinds = {"steps": "<u2", "colours": "u1"}
+    return [np.frombuffer(base64.b64decode(points[name]), kind).reshape(-1, 3) for name, kind in kinds.items()]
+
+
 def test_points_come_back_from_their_steps(tmp_path):
     scene = write_scene(tmp_path, ply_file_path="points.ply")
     generator = np.random.default_rng(0)
@@ -196,17 +202,15 @@ def test_points_come_back_from_their_steps(tmp_path):
     write_cloud(scene, points_m, rgb)
     found = show_points(read_scene(scene))
     assert found is not None
-    data = found.data()
-    steps = np.frombuffer(base64.b64decode(str(data["steps"])), "<u2").reshape(-1, 3)
-    places_m = np.array(data["low"]) + steps * np.array(data["step"])
+    steps, colours = places_and_colours(found)
+    places_m = np.array(found["low"]) + steps * np.array(found["step"])
     nearest = np.abs(places_m[:, None] - points_m[None]).max(-1)
     assert sorted(nearest.argmin(1)) == list(range(20, 500)) and nearest.min(1).max() < 60 / 65535
-    assert np.array_equal(np.frombuffer(base64.b64decode(str(data["colours"])), np.uint8).reshape(-1, 3),
-                          rgb[nearest.argmin(1)])  # fmt: skip
-    assert len(found.training_m) == 8 and len(found.held_out_m) == 1 and [len(path) for path in found.paths_m] == [9]
-    assert np.allclose(found.held_out_m[0], found.paths_m[0][4])
+    assert np.array_equal(colours, rgb[nearest.argmin(1)])
+    assert len(found["training"]) == 8 and len(found["heldOut"]) == 1 and [len(path) for path in found["paths"]] == [9]
+    assert found["heldOut"][0] == found["paths"][0][4]
     few = show_points(read_scene(scene), 100)
-    assert few is not None and len(few.steps) == len(few.colours) == 100
+    assert few is not None and [len(each) for each in places_and_colours(few)] == [100, 100]
 
 
 def test_points_without_colours_are_coloured_by_height(tmp_path):
@@ -214,7 +218,8 @@ def test_points_without_colours_are_coloured_by_height(tmp_path):
     write_cloud(scene, np.array([[1.0, 0, height] for height in np.linspace(-3, 3, 50)]))
     found = show_points(read_scene(scene))
     assert found is not None
-    low, high = (found.colours[found.steps[:, 2].argsort()[place]].astype(int) for place in (0, -1))
+    steps, colours = places_and_colours(found)
+    low, high = (colours[steps[:, 2].argsort()[place]].astype(int) for place in (0, -1))
     assert low[2] > low[0] and high[0] > high[2]
 
 
@@ -302,7 +307,7 @@ def write_cloud(folder: Path, points_m: np.ndarray, rgb: np.ndarray | None = Non
 
 
 @pytest.fixture(scope="module")
-def cloud(tmp_path_factory) -> ShownPoints:
+def cloud(tmp_path_factory) -> dict[str, Any]:
     """A wall of red points ahead of the cameras."""
     scene = write_scene(tmp_path_factory.mktemp("scene"), ply_file_path="points.ply")
     across, up = (axis.ravel() for axis in np.meshgrid(np.linspace(-8, 8, 60), np.linspace(-4, 4, 60)))
@@ -631,7 +636,7 @@ def test_points_are_seen_in_3d(opened, cloud):
     assert canvas.get_attribute("data-points") is None  # nothing is drawn before it is seen
     canvas.scroll_into_view_if_needed()
     page.locator(".space canvas[data-points]").wait_for()
-    assert canvas.get_attribute("data-points") == str(len(cloud.steps))
+    assert canvas.get_attribute("data-points") == str(len(places_and_colours(cloud)[0]))
     wait_for_frames(page, 3)
     first = space(page)
     assert red(first).sum() > 500  # the wall

@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("eye", type=Path, help="what birds-eye wrote")
     given = parser.parse_args()
     said = read_json(given.drive / "drive.json")["options"]
-    known = {name: said[name] for name in ("scene", "frames", "size", "seed", "moving")}
+    known = {name: said[name] for name in ("scene", "frames", "size", "seed")}
     options = SynthesizeOptions(given.drive, **known)
     colours = np.asarray(Image.open(given.eye / PICTURE)).astype(np.float64) / 255
     heights_m = np.asarray(Image.open(given.eye / HEIGHT)).astype(np.float64)

@@ -2,13 +2,13 @@
 
     python -m benchmarks.robustness.lidar --output outputs/lidar
 
-Synthesises a street at KITTI-360's picture size, and one at a quarter of it with cars that drive (some ten minutes the
-first time), then prints
+Synthesises a street at KITTI-360's picture size, and one with traffic at a quarter of it (some ten minutes the first
+time), then prints
 
   de-skewing   distance of each LiDAR point from where it truly was, raw and de-skewed;
   projection   of the pixels with a LiDAR point, how many are wrong: more than 5 % outside the true distances of the 3×3
                pixels around; how many of the right ones are kept when what is hidden or has moved is left out;
-  moving cars  the same with cars that drive, with and without the check for free space.
+  what moves   the same with traffic, with and without the check for free space.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def projection(made: SynthesizeOptions) -> Table:
 
 
 def moving(made: SynthesizeOptions) -> Table:
-    title = f"{made.moving} cars that drive, {made.size}×{made.size} px"
+    title = f"Traffic, {made.size}×{made.size} px"
     table = Table("K", "free space", "camera", *COLUMNS, title=title)
     for reach in (3, 5):
         for free_space in (True, False):
@@ -179,7 +179,7 @@ def main() -> None:
     torch.set_num_threads(1)
     console = Console(width=120)
     street = drive(arguments.output / "street", scene="street", frames=arguments.frames, size=arguments.size)
-    cars = drive(arguments.output / "street_with_cars", scene="street", frames=24, size=arguments.size // 4, moving=3)
+    cars = drive(arguments.output / "traffic", scene="traffic", frames=24, size=arguments.size // 4)
     console.print(deskewing(street))
     console.print(projection(street))
     console.print(moving(cars))

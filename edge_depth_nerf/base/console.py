@@ -27,6 +27,7 @@ _MAX_THREADS = 8
 TOLD_EVERY_S = 10.0
 """Where bars cannot be drawn, a line tells so often how far the work is."""
 
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
@@ -88,12 +89,23 @@ def progress_bars(console: Console, counted: bool = False, transient: bool = Fal
     )
 
 
+def in_turn(items: Sequence[Item], title: str, console: Console, done: int = 0) -> Iterator[Item]:
+    """Go through items and show how far that is; `done` others were done before."""
+    with progress_bars(console, counted=True) as progress:
+        task = progress.add_task(title, total=done + len(items), completed=done)
+        for item in items:
+            yield item
+            progress.advance(task)
+
+
 def run_jobs(jobs: Sequence[Callable[[], Result]], title: str, console: Console) -> list[Result]:
     """Do all jobs, several at once, and give their results in order; the first error ends it.
 
     Decoding, encoding and torch leave Python's lock. Torch gets one thread of its own in each job: the jobs share the
     cores already.
     """
+    if not jobs:
+        return []
     import torch  # takes seconds, which a worker of a cluster need not wait for
 
     progress = progress_bars(console, counted=True)

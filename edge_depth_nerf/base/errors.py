@@ -35,6 +35,12 @@ class InputError(ValueError):
         super().__init__("".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in message))
 
 
+def require(fine: bool, found: str, expected: str) -> None:
+    """Raise an InputError unless all is fine."""
+    if not fine:
+        raise InputError(f"{found}: expected {expected}.")
+
+
 @contextmanager
 def found_in(where: str) -> Iterator[None]:
     """Put in front of an InputError's message where the faulty input stands."""

@@ -18,7 +18,7 @@ import time
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -185,13 +185,20 @@ def read_json_object(path: Path, *keys: str) -> dict[str, Any]:
     return content
 
 
+def encoded(suffix: str, image: NDArray, options: Sequence[int] = ()) -> bytes:
+    """Encode H×W×3 RGB, H×W×4 RGBA or H×W in the format of a suffix, with OpenCV's options."""
+    pixels = np.ascontiguousarray(image)
+    if image.ndim == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR if image.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
+    ok, content = cv2.imencode(suffix, pixels, options)
+    if not ok:
+        raise RuntimeError(f"{suffix}: encoding failed for {image.dtype} {image.shape}")
+    return content.tobytes()
+
+
 def write_png(path: Path, image: NDArray) -> None:
     """Write H×W×3 uint8 RGB, H×W uint8 or H×W uint16 as PNG, atomically."""
-    pixels = image[..., ::-1] if image.ndim == 3 else image
-    ok, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 4])
-    if not ok:
-        raise RuntimeError(f"{path}: PNG encoding failed for {image.dtype} {image.shape}")
-    write_bytes(path, encoded.tobytes())
+    write_bytes(path, encoded(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 4]))
 
 
 class PictureHead(NamedTuple):
@@ -457,6 +464,19 @@ def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDA
     except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: cannot be read as arrays ({error}). Delete or make the file again.") from None
     return found
+
+
+def pcd_bytes(rows: NDArray) -> bytes:
+    """Encode points as a binary PCD file. The fields of `rows` are those of the file, in their order."""
+    names = rows.dtype.names or ()
+    kinds = [rows.dtype[name] for name in names]
+    header = (
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {' '.join(names)}\n"
+        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}\nTYPE {' '.join(kind.kind.upper() for kind in kinds)}\n"
+        f"COUNT {' '.join('1' for _ in kinds)}\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {len(rows)}\nDATA binary\n"
+    )
+    return header.encode() + rows.tobytes()
 
 
 def open_folder(output: Path, record_path: Path, record: dict[str, Any], what: str) -> None:

@@ -13,8 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -135,7 +134,8 @@ def _confirmed(
     agree, against = np.zeros(len(points_m), int), np.zeros(len(points_m), int)
     for neighbour in near:
         prior = priors.read(neighbour)
-        seen, row, column, range_m = _seen_at(neighbour, points_m)
+        seen, row, column = neighbour.pixels_of(points_m)
+        range_m = np.linalg.norm(points_m[seen] - neighbour.position_m, axis=1)
         nearest_m, furthest_m = _around(prior.distance_m)
         nearest_m, furthest_m = nearest_m[row, column], furthest_m[row, column]
         known = prior.distance_m[row, column] > 0
@@ -151,20 +151,6 @@ def _around(distance_m: Float32[np.ndarray, "h w"]) -> tuple[NDArray, NDArray]:
     square = np.ones((3, 3), np.uint8)
     nearest = cv2.erode(np.where(distance_m > 0, distance_m, np.float32(np.inf)), square)
     return nearest, cv2.dilate(distance_m, square)
-
-
-def _seen_at(
-    picture: ScenePicture, points_m: Float64[np.ndarray, "points 3"]
-) -> tuple[
-    Int64[np.ndarray, "seen"], Int64[np.ndarray, "seen"], Int64[np.ndarray, "seen"], Float64[np.ndarray, "seen"]
-]:
-    """Give which points lie in a picture, hidden ones included: their indices, rows, columns and distances."""
-    pose = picture.pose
-    in_camera = (points_m - pose[:3, 3]) @ pose[:3, :3]
-    pixels, valid = picture.lens.project(torch.from_numpy(in_camera))
-    seen = np.flatnonzero((valid & picture.lens.inside(pixels)).numpy())
-    column, row = np.floor(pixels.numpy()[seen]).astype(np.int64).T
-    return seen, row, column, np.linalg.norm(in_camera[seen], axis=1)
 
 
 # ---- parts, and their sum --------------------------------------------------------------------------------------

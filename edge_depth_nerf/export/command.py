@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -86,7 +86,7 @@ def _write(output: Path, options: ExportOptions, scene: SceneFolder, priors: Pri
     training = [picture for picture in scene.pictures if not picture.held_out]
     only_cloud = options.form == "points" or options.pictures == "training"
     needed = training if only_cloud else scene.pictures
-    _run([partial(priors.make, each) for each in needed if not priors.is_made(each)], "Making the prior", console)
+    run_jobs([partial(priors.make, each) for each in needed if not priors.is_made(each)], "Making the prior", console)
     cloud = _cloud(output / WORK / "cloud", options, priors, training, console)
     figures = figures_of(cloud, scene.points_m())
     write_json(output / EXPORT_FIGURES, figures)
@@ -97,12 +97,12 @@ def _write(output: Path, options: ExportOptions, scene: SceneFolder, priors: Pri
     views, writer = views_of(scene, priors.stems, options), ViewWriter(output, priors, options)
     of_pictures = [list(group) for _, group in groupby(views, lambda view: view.picture.name)]
     missing = [group for group in of_pictures if not all(map(writer.is_written, group))]
-    counts = _run([partial(writer.write, group) for group in missing], "Writing pictures and maps", console)
+    counts = run_jobs([partial(writer.write, group) for group in missing], "Writing pictures and maps", console)
     if options.form == "nerfstudio":
         write_bytes(output / POINTS, ply_bytes(cloud_rows(cloud, np.zeros(3))))
         write_transforms(output, scene, views, writer)
     else:
-        seen = _run([partial(writer.seen, view, cloud) for view in views], "Finding what each view sees", console)
+        seen = run_jobs([partial(writer.seen, view, cloud) for view in views], "Finding what each view sees", console)
         write_model(output, views, seen, cloud)
         if empty := [view.file_name for view, each in zip(views, seen, strict=True) if not len(each.index)]:
             say(
@@ -122,10 +122,6 @@ def _write(output: Path, options: ExportOptions, scene: SceneFolder, priors: Pri
     _show(console, output, figures, views)
 
 
-def _run(jobs: Sequence[Callable[[], Any]], title: str, console: Console) -> list[Any]:
-    return run_jobs(jobs, title, console) if jobs else []
-
-
 def _cloud(folder: Path, options: ExportOptions, priors: Priors, training: Sequence[Any], console: Console) -> Cloud:
     """Make the cloud of the training pictures, each of which has a file of its own until all are there."""
     paths = {picture.name: folder / f"{priors.stems[picture.name]}.npz" for picture in training}
@@ -134,7 +130,7 @@ def _cloud(folder: Path, options: ExportOptions, priors: Priors, training: Seque
         write_part(paths[picture.name], part_of(priors, picture, training, options.voxel_m, options.most_error))
 
     missing = [picture for picture in training if not paths[picture.name].is_file()]
-    _run([partial(make, picture) for picture in missing], "Fusing the cloud", console)
+    run_jobs([partial(make, picture) for picture in missing], "Fusing the cloud", console)
     cloud = merge_parts(list(paths.values()), options.voxel_m, options.most_points)
     if not len(cloud.points_m):
         raise InputError(

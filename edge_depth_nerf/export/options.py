@@ -9,7 +9,7 @@ from typing import Literal
 
 import tyro
 
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import InputError, require
 
 Form = Literal["nerfstudio", "colmap", "points"]
 Views = Literal["fisheye", "pinhole"]
@@ -63,12 +63,9 @@ class ExportOptions:
                 f"--fov-deg {self.fov_deg}: expected {LEAST_FOV_DEG:g} to {LARGEST_FOV_DEG:g} degrees. Wider pinhole "
                 "views show little but their rim."
             )
-        if not (math.isfinite(self.voxel_m) and self.voxel_m >= LEAST_VOXEL_M):
-            raise InputError(f"--voxel-m {self.voxel_m}: expected {LEAST_VOXEL_M} m or more.")
-        if not (math.isfinite(self.most_error) and self.most_error > 0):
-            raise InputError(f"--most-error {self.most_error}: expected a positive number.")
-        if self.most_points < 1:
-            raise InputError(f"--most-points {self.most_points}: expected 1 or more.")
+        require(LEAST_VOXEL_M <= self.voxel_m < math.inf, f"--voxel-m {self.voxel_m}", f"{LEAST_VOXEL_M} m or more")
+        require(0 < self.most_error < math.inf, f"--most-error {self.most_error}", "a positive number")
+        require(self.most_points >= 1, f"--most-points {self.most_points}", "1 or more")
 
     def folder(self) -> Path:
         """Give the folder that is written to."""

@@ -7,29 +7,35 @@ inside something, and where no training picture saw what the field shows.
 
 from __future__ import annotations
 
-import io
 import shutil
+from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 from rich.console import Console
 
 from edge_depth_nerf import __version__
-from edge_depth_nerf.base.console import progress_bars, say
+from edge_depth_nerf.base.console import in_turn, say
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import open_folder, read_npz, remove_leftovers, write_bytes, write_text
-from edge_depth_nerf.films.birds_eye_options import RANGES, BirdsEyeOptions
+from edge_depth_nerf.base.files import (
+    encoded,
+    open_folder,
+    read_npz,
+    remove_leftovers,
+    write_atomically,
+    write_bytes,
+    write_text,
+)
 from edge_depth_nerf.films.ground_plan import TILE_PX, GroundPlan, Tile, driven_path
+from edge_depth_nerf.films.options import RANGES, BirdsEyeOptions
 from edge_depth_nerf.films.paths import up_of
-from edge_depth_nerf.films.placed import placed
+from edge_depth_nerf.films.placed import placed, poses_of
 from edge_depth_nerf.films.scanning import HIT, load_model
 from edge_depth_nerf.films.seen import TrainingViews
 from edge_depth_nerf.jobs.runs import steps_done
 from edge_depth_nerf.plugin.compat import quiet_host
 from edge_depth_nerf.plugin.scanning import Caster
-from edge_depth_nerf.scene.reader import SceneFolder
 
 PICTURE, HEIGHT, RECORD, TILES = "road.png", "height.tif", "birds_eye.json", "tiles"
 BELOW_M = 8.0
@@ -56,14 +62,14 @@ def render_birds_eye(options: BirdsEyeOptions, console: Console | None = None) -
     options.check()
     console = console or Console()
     output = options.output or options.load_config.parent / "birds_eye"
-    with console.status("Reading the scene's place in the model's coordinates from nerfstudio …"), quiet_host():
-        scene, to_model = placed(options.load_config, options.scene)
-    if up_of(np.stack([picture.rotation for picture in scene.pictures]))[2] < 1:
+    scene, to_model = placed(options, console)
+    poses = poses_of(scene.pictures)
+    if up_of(poses[:, :3, :3])[2] < 1:
         raise InputError(
             f"{scene.path}: z is not up in this scene, so no picture can be taken from above. Turn the scene, or "
             "process the drive with `edge-depth-nerf process`."
         )
-    path_m = driven_path([picture.frame for picture in scene.pictures], _positions_m(scene))
+    path_m = driven_path([picture.frame for picture in scene.pictures], poses[:, :3, 3])
     plan = GroundPlan(path_m, options.metres_per_pixel, options.margin_m)
     record = {
         "made_by": f"edge-depth-nerf {__version__}",
@@ -82,7 +88,11 @@ def render_birds_eye(options: BirdsEyeOptions, console: Console | None = None) -
         if missing:
             with console.status("Loading the model …"), quiet_host():
                 caster = Caster(load_model(options.load_config, scene.path), to_model)
-            _render(output, missing, len(tiles), plan, caster, TrainingViews(scene, caster), options.above_m, console)
+            views = TrainingViews(scene, caster)
+            for tile in in_turn(missing, "Rendering the road", console, done=len(tiles) - len(missing)):
+                colours, height_m = render_tile(plan, tile, caster, views, options.above_m)
+                arrays = {"colours": colours, "height_m": height_m}
+                write_atomically(_tile_path(output, tile), partial(np.savez_compressed, **arrays))
         _put_together(output, tiles, plan, scene.world_offset_m)
     shutil.rmtree(output / TILES, ignore_errors=True)
     side = f"{100 * options.metres_per_pixel:g} cm"
@@ -91,33 +101,8 @@ def render_birds_eye(options: BirdsEyeOptions, console: Console | None = None) -
     return output
 
 
-def _positions_m(scene: SceneFolder) -> np.ndarray:
-    return np.stack([picture.position_m for picture in scene.pictures])
-
-
 def _tile_path(output: Path, tile: Tile) -> Path:
     return output / TILES / f"{tile.row:06d}_{tile.column:06d}.npz"
-
-
-def _render(
-    output: Path,
-    missing: list[Tile],
-    count: int,
-    plan: GroundPlan,
-    caster: Caster,
-    views: TrainingViews,
-    above_m: float,
-    console: Console,
-) -> None:
-    """Write the tiles that are missing."""
-    with progress_bars(console, counted=True) as progress:
-        task = progress.add_task("Rendering the road", total=count, completed=count - len(missing))
-        for tile in missing:
-            colours, height_m = render_tile(plan, tile, caster, views, above_m)
-            file = io.BytesIO()
-            np.savez_compressed(file, colours=colours, height_m=height_m)
-            write_bytes(_tile_path(output, tile), file.getvalue())
-            progress.advance(task)
 
 
 def render_tile(
@@ -153,10 +138,7 @@ def _put_together(output: Path, tiles: list[Tile], plan: GroundPlan, offset_m: n
         arrays = read_npz(_tile_path(output, tile), ("colours", "height_m"), 4 * TILE_PX**2)
         colours[tile.slices], height_m[tile.slices] = arrays["colours"], arrays["height_m"]
     height_m += np.float32(offset_m[2])
-    for name, pixels in ((HEIGHT, height_m), (PICTURE, cv2.cvtColor(colours, cv2.COLOR_RGBA2BGRA))):
+    for name, pixels in ((HEIGHT, height_m), (PICTURE, colours)):
         suffix = Path(name).suffix
         write_text(output / name.replace(suffix, f"{suffix[:2]}{suffix[-1]}w"), plan.world_file(offset_m))
-        ok, encoded = cv2.imencode(suffix, pixels)
-        if not ok:
-            raise RuntimeError(f"{output / name}: encoding failed")
-        write_bytes(output / name, encoded.tobytes())
+        write_bytes(output / name, encoded(suffix, pixels))

@@ -23,7 +23,6 @@ from edge_depth_nerf.films.options import LARGEST_PX, CameraPathOptions, FilmCam
 from edge_depth_nerf.films.paths import CameraPath, lane_shift, orbit, replay, up_of
 from edge_depth_nerf.films.placed import outside, placed, poses_of
 from edge_depth_nerf.films.seen import TrainingViews
-from edge_depth_nerf.plugin.compat import quiet_host
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 DEFAULT_RATE_HZ = 10.0
@@ -86,8 +85,7 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
             "ffmpeg, or brew install ffmpeg.",
             style="yellow",
         )
-    with console.status("Reading the scene's place in the model's coordinates from nerfstudio …"), quiet_host():
-        scene, to_model = placed(options.load_config, options.scene)
+    scene, to_model = placed(options, console)
 
     pictures = _followed(scene, options.follow)
     shown = camera_of(options, pictures[0].lens)
@@ -178,7 +176,7 @@ def path_file(
     """Return the path file's content: the film's poses and lens, and keyframes for nerfstudio's viewer."""
     frames = len(camera_to_model)
     seconds = frames / fps
-    aspect = lens.width / lens.height
+    view = {"fov": lens.fov_deg, "aspect": lens.width / lens.height}
     keyframes = spread_over(frames, KEYFRAMES)
     return {
         "made_by": f"edge-depth-nerf {__version__}",
@@ -191,14 +189,8 @@ def path_file(
         "smoothness_value": 0.0,
         "default_fov": lens.fov_deg,
         "default_transition_sec": seconds / max(1, len(keyframes) - 1),
-        "keyframes": [
-            {"matrix": camera_to_model[index].flatten().tolist(), "fov": lens.fov_deg, "aspect": aspect}
-            for index in keyframes
-        ],
-        "camera_path": [
-            {"camera_to_world": pose.flatten().tolist(), "fov": lens.fov_deg, "aspect": aspect}
-            for pose in camera_to_model
-        ],
+        "keyframes": [{"matrix": pose.flatten().tolist(), **view} for pose in camera_to_model[keyframes]],
+        "camera_path": [{"camera_to_world": pose.flatten().tolist(), **view} for pose in camera_to_model],
     }
 
 

@@ -10,7 +10,6 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -63,63 +62,39 @@ class Tile:
         return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
 
 
-@dataclass(frozen=True, eq=False)
 class GroundPlan:
-    """Pixels within a distance of the path.
+    """Pixels within a distance of the path."""
 
-    Raises:
-        InputError: there are too many.
-    """
+    def __init__(self, path_m: Float64[np.ndarray, "places 3"], metres_per_pixel: float, margin_m: float) -> None:
+        """Lay them out.
 
-    path_m: Float64[np.ndarray, "places 3"]
-    metres_per_pixel: float
-    margin_m: float
-
-    def __post_init__(self) -> None:
+        Raises:
+            InputError: there are too many.
+        """
+        self._path_m, self._side_m, self._margin_m = path_m, metres_per_pixel, margin_m
+        self._tree = KDTree(path_m[:, :2])
+        low, high = path_m.min(axis=0) - margin_m, path_m.max(axis=0) + margin_m
+        # in whole pixels from the scene's origin
+        self._west, self._north = math.floor(low[0] / metres_per_pixel), math.ceil(high[1] / metres_per_pixel)
+        self.width = math.ceil(high[0] / metres_per_pixel) - self._west
+        self.height = self._north - math.floor(low[1] / metres_per_pixel)
         if self.width * self.height > MOST_PIXELS:
             raise InputError(
-                f"--metres-per-pixel {self.metres_per_pixel:g}: the picture would be {self.width}×{self.height} px, "
+                f"--metres-per-pixel {metres_per_pixel:g}: the picture would be {self.width}×{self.height} px, "
                 f"more than {MOST_PIXELS // 1_000_000} million. Use larger pixels, or train on a shorter stretch."
             )
 
-    @cached_property
-    def _corners(self) -> tuple[int, int, int, int]:
-        """West, north, east, south, in whole pixels from the scene's origin."""
-        low, high = self.path_m.min(axis=0) - self.margin_m, self.path_m.max(axis=0) + self.margin_m
-        side = self.metres_per_pixel
-        return (
-            math.floor(low[0] / side),
-            math.ceil(high[1] / side),
-            math.ceil(high[0] / side),
-            math.floor(low[1] / side),
-        )
-
-    @property
-    def width(self) -> int:
-        """Columns."""
-        return self._corners[2] - self._corners[0]
-
-    @property
-    def height(self) -> int:
-        """Rows."""
-        return self._corners[1] - self._corners[3]
-
-    @cached_property
-    def _tree(self) -> KDTree:
-        return KDTree(self.path_m[:, :2])
-
     def tiles(self) -> Iterator[Tile]:
         """Give the tiles, row by row, that may have pixels within the margin."""
-        half_m = TILE_PX * self.metres_per_pixel / math.sqrt(2)
+        half_m = TILE_PX * self._side_m / math.sqrt(2)
         for row in range(0, self.height, TILE_PX):
             for column in range(0, self.width, TILE_PX):
                 middle = self._place(np.array([row + TILE_PX / 2]), np.array([column + TILE_PX / 2]))[0]
-                if self._tree.query(middle)[0] <= self.margin_m + half_m:
+                if self._tree.query(middle)[0] <= self._margin_m + half_m:
                     yield Tile(row, column, min(TILE_PX, self.height - row), min(TILE_PX, self.width - column))
 
     def _place(self, row: np.ndarray, column: np.ndarray) -> Float64[np.ndarray, "n 2"]:
-        west, north = self._corners[:2]
-        return np.stack([west + column, north - row], axis=-1) * self.metres_per_pixel
+        return np.stack([self._west + column, self._north - row], axis=-1) * self._side_m
 
     def of_tile(
         self, tile: Tile
@@ -129,11 +104,11 @@ class GroundPlan:
         place = self._place(tile.row + row, tile.column + column)
         apart_m, nearest = self._tree.query(place)
         shape = tile.height, tile.width
-        near = (apart_m <= self.margin_m).reshape(shape)
-        return place.reshape(*shape, 2), self.path_m[nearest, 2].reshape(shape), near
+        near = (apart_m <= self._margin_m).reshape(shape)
+        return place.reshape(*shape, 2), self._path_m[nearest, 2].reshape(shape), near
 
     def world_file(self, world_offset_m: Float64[np.ndarray, "3"]) -> str:
         """Give the world file: sides of a pixel, and the centre of the first one in the recording's world."""
         first = self._place(np.array([0.5]), np.array([0.5]))[0] + world_offset_m[:2]
-        side = self.metres_per_pixel
+        side = self._side_m
         return "".join(f"{value:.9f}\n" for value in (side, 0, 0, -side, *first))

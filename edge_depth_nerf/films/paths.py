@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras.transforms import rigid
+from edge_depth_nerf.lidar.trajectory import check_times
 
 EASE = 0.25
 """Share of a shifted film in which the camera moves aside. It moves back during the same share at the end."""
@@ -49,16 +50,7 @@ class CameraPath:
     """Unit vector upwards, in the scene."""
 
     def __post_init__(self) -> None:
-        if len(self.times_s) < 2:
-            raise InputError(
-                f"a film needs a camera with at least two pictures of the drive, found {len(self.times_s)}."
-            )
-        if not (np.diff(self.times_s) > 0).all():
-            first = int(np.argmax(~(np.diff(self.times_s) > 0)))
-            raise InputError(
-                f"the times of a drive must increase, but picture {first + 2} is at {self.times_s[first + 1]:.6f} s "
-                f"and the one before it at {self.times_s[first]:.6f} s."
-            )
+        check_times(self.times_s, "picture")
 
     @property
     def duration_s(self) -> float:

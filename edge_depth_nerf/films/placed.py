@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
+from rich.console import Console
 from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json_object
 from edge_depth_nerf.cameras.transforms import rigid
+from edge_depth_nerf.films.options import TrainedOptions
 from edge_depth_nerf.films.training import read_dataparser
+from edge_depth_nerf.plugin.compat import quiet_host
 from edge_depth_nerf.plugin.scanning import SceneToModel
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
@@ -44,22 +47,19 @@ def outside(poses: Float64[np.ndarray, "n 4 4"], scene: SceneFolder) -> str | No
     )
 
 
-def placed(load_config: Path, moved_to: Path | None) -> tuple[SceneFolder, SceneToModel]:
+def placed(options: TrainedOptions, console: Console) -> tuple[SceneFolder, SceneToModel]:
     """Return the scene, and its place in the model's coordinates by the training's own dataparser.
-
-    Args:
-        load_config: the training's config.yml.
-        moved_to: the scene folder, if it was moved after the training.
 
     Raises:
         FileNotFoundError: there is no scene, or no config.yml, at the given path.
         InputError: the scene or the training cannot be used.
     """
-    dataparser = read_dataparser(load_config)
-    scene = read_scene(moved_to or Path(dataparser.data))
-    dataparser.data = scene.path
-    outputs = dataparser.setup().get_dataparser_outputs(split="train")
-    _check_unchanged(outputs, load_config.parent / SAVED_TRANSFORM, scene)
+    with console.status("Reading the scene's place in the model's coordinates from nerfstudio …"), quiet_host():
+        dataparser = read_dataparser(options.load_config)
+        scene = read_scene(options.scene or Path(dataparser.data))
+        dataparser.data = scene.path
+        outputs = dataparser.setup().get_dataparser_outputs(split="train")
+    _check_unchanged(outputs, options.load_config.parent / SAVED_TRANSFORM, scene)
     to_model = SceneToModel.of(outputs, scene.meta)
 
     trained = outputs.cameras.camera_to_worlds.numpy()[:, :3, 3].astype(np.float64)

@@ -6,22 +6,28 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64
-from numpy.typing import NDArray
+from jaxtyping import Float64
 from rich.console import Console
 
 from edge_depth_nerf import __version__
-from edge_depth_nerf.base.console import progress_bars, say
+from edge_depth_nerf.base.console import in_turn, say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import open_folder, write_json, write_text
 from edge_depth_nerf.cameras.transforms import rigid
 from edge_depth_nerf.films.intensities import Intensities
+from edge_depth_nerf.films.options import RenderLidarOptions
 from edge_depth_nerf.films.paths import CameraPath, lane_shift
 from edge_depth_nerf.films.placed import outside, placed
-from edge_depth_nerf.films.scan_files import Scan, read_points, write_scan
-from edge_depth_nerf.films.scan_film import ScanFilm
-from edge_depth_nerf.films.scan_options import RenderLidarOptions
-from edge_depth_nerf.films.scanning import RayDrop, evaluate, learn_ray_drop, load_model, recorded_pattern, scan
+from edge_depth_nerf.films.scan_files import read_points, write_scan
+from edge_depth_nerf.films.scan_film import write_film
+from edge_depth_nerf.films.scanning import (
+    LearnedScanner,
+    RayDrop,
+    evaluate,
+    learn_ray_drop,
+    load_model,
+    recorded_pattern,
+)
 from edge_depth_nerf.lidar.patterns import SENSORS, TEN_TURNS, ScanPattern, pattern_of_scan, rings_of
 from edge_depth_nerf.lidar.scans import ScanFormat, read_scan
 from edge_depth_nerf.lidar.trajectory import Trajectory
@@ -29,16 +35,10 @@ from edge_depth_nerf.plugin.compat import quiet_host
 from edge_depth_nerf.plugin.scanning import Caster
 from edge_depth_nerf.process.poses import read_tum, tum_text
 from edge_depth_nerf.scene.reader import SceneFolder
-from edge_depth_nerf.scene.sweeps import UNKNOWN_RING, SceneScanner, scanners_of
+from edge_depth_nerf.scene.sweeps import SceneScanner, scanners_of
 
 RECORD, POSES, FIGURES, FILM = "scans.json", "poses.txt", "figures.json", "scans.webp"
 UP = np.array([0.0, 0.0, 1.0])
-_WORDS = {
-    "sweeps": "Held-out sweeps",
-    "sweeps_in_pictures": "Of these, inside a picture of their frame",
-    "beams": "Held-out beams",
-    "beams_in_pictures": "Of these, inside a picture of their frame",
-}
 
 
 def render_lidar(options: RenderLidarOptions, console: Console | None = None) -> Path:
@@ -58,8 +58,7 @@ def render_lidar(options: RenderLidarOptions, console: Console | None = None) ->
     options.check()
     console = console or Console()
     output = options.output or options.load_config.parent / "scans"
-    with console.status("Reading the scene's place in the model's coordinates from nerfstudio …"), quiet_host():
-        scene, to_model = placed(options.load_config, options.scene)
+    scene, to_model = placed(options, console)
     scanner = _scanner(scene, options)
     recorded = None if scanner is None else recorded_pattern(scanner)
     pattern = _pattern(options, scanner, recorded)
@@ -76,21 +75,29 @@ def render_lidar(options: RenderLidarOptions, console: Console | None = None) ->
     open_folder(output, output / RECORD, record, "scans")
     with console.status("Loading the model …"), quiet_host():
         caster = Caster(load_model(options.load_config, scene.path), to_model)
-    ray_drop = RayDrop()
+    ray_drop, intensities = RayDrop(), None
     if scanner is not None and recorded is not None:
         with console.status("Learning which rays come back"):
             ray_drop = learn_ray_drop(caster, scanner, recorded)
-    with console.status("Learning how bright places are"):
-        intensities = None if scanner is None else Intensities.learned(scanner)
-    _render(output, options, caster, pattern, ray_drop, intensities, pattern is recorded, times_s, poses, console)
-    _write_poses(output / POSES, scene, times_s[:: options.every], poses[:: options.every])
-    say(console, f"{len(times_s[:: options.every])} scans of {len(pattern.elevation_rad)} × {pattern.firings} rays:")
-    say(console, f"  {output}")
+    if scanner is not None:
+        with console.status("Learning how bright places are"):
+            intensities = Intensities.learned(scanner)
+    learned, path = LearnedScanner(caster, recorded, ray_drop, intensities), Trajectory(times_s, poses)
+    files = {number: output / f"{number:010d}.{options.form}" for number in range(0, len(times_s), options.every)}
+    missing = [number for number, file in files.items() if not file.is_file()]
+    for number in in_turn(missing, "Rendering scans", console, done=len(files) - len(missing)):
+        write_scan(files[number], learned.render(pattern, float(times_s[number]), path))
+    times_s, poses = times_s[:: options.every], poses[:: options.every]
+    to_world = rigid(poses[:, :3, :3], poses[:, :3, 3] + scene.world_offset_m)
+    write_text(output / POSES, f"# time x y z qx qy qz qw: scanner to world\n{tum_text(times_s, to_world)}")
+    say(console, f"{len(files)} scans of {len(pattern.elevation_rad)} × {pattern.firings} rays:\n  {output}")
     if options.film:
-        _film(output, options, times_s, console)
+        scans_m = map(read_points, in_turn([*files.values()], "Drawing the film", console))
+        write_film(output / FILM, scans_m, float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.1)
+        say(console, f"  {output / FILM}")
     if scanner is not None:
         with console.status("Comparing with what no training saw"):
-            figures = evaluate(caster, scene, scanner, recorded, ray_drop, intensities)
+            figures = evaluate(learned, scene, scanner)
         write_json(output / FIGURES, figures)
         _show(figures, console)
     return output
@@ -160,75 +167,15 @@ def _path(
     return times_s, poses
 
 
-def _render(
-    output: Path,
-    options: RenderLidarOptions,
-    caster: Caster,
-    pattern: ScanPattern,
-    ray_drop: RayDrop,
-    intensities: Intensities | None,
-    own: bool,
-    times_s: Float64[np.ndarray, "scans"],
-    poses: Float64[np.ndarray, "scans 4 4"],
-    console: Console,
-) -> None:
-    """Write the scans that are missing."""
-    path = Trajectory(times_s, poses)
-    numbers = range(0, len(times_s), options.every)
-    missing = [each for each in numbers if not (output / f"{each:010d}.{options.form}").is_file()]
-    with progress_bars(console, counted=True) as progress:
-        task = progress.add_task("Rendering scans", total=len(numbers), completed=len(numbers) - len(missing))
-        for number in missing:
-            cast, origins, directions = scan(caster, pattern, float(times_s[number]), path)
-            kept = ray_drop.kept(cast, pattern.reach_m)
-            # in the order of time: firing by firing
-            firing, ring = np.nonzero(kept.T)
-            distance_m = cast.distance_m[ring, firing][:, None]
-            met_m = origins[firing] + directions[ring, firing] * distance_m
-            rendered = Scan(
-                (pattern.directions[ring, firing] * distance_m).astype(np.float32),
-                pattern.offset_s[firing].astype(np.float32),
-                ring.astype(np.int16),
-                _bright(intensities, met_m, ring if own else None, distance_m[:, 0]),
-            )
-            write_scan(output / f"{number:010d}.{options.form}", rendered)
-            progress.advance(task)
-
-
-def _bright(
-    intensities: Intensities | None, met_m: NDArray, ring: NDArray | None, distance_m: NDArray
-) -> Float32[np.ndarray, "points"] | None:
-    """Give the intensities of a scan's points; None where they are unknown. Another scanner's rings say nothing."""
-    if intensities is None or not len(met_m):
-        return None
-    return intensities.at(met_m, np.full(len(met_m), UNKNOWN_RING) if ring is None else ring, distance_m)
-
-
-def _film(output: Path, options: RenderLidarOptions, times_s: Float64[np.ndarray, "scans"], console: Console) -> None:
-    """Write the film of all scans, from their files."""
-    film = ScanFilm(float(np.median(np.diff(times_s[:: options.every]))) if len(times_s) > options.every else 0.1)
-    with progress_bars(console, counted=True) as progress:
-        for number in progress.track(range(0, len(times_s), options.every), description="Drawing the film"):
-            film.add(read_points(output / f"{number:010d}.{options.form}"))
-    film.write(output / FILM)
-    say(console, f"  {output / FILM}")
-
-
-def _write_poses(
-    path: Path, scene: SceneFolder, times_s: Float64[np.ndarray, "scans"], poses: Float64[np.ndarray, "scans 4 4"]
-) -> None:
-    to_world = rigid(poses[:, :3, :3], poses[:, :3, 3] + scene.world_offset_m)
-    write_text(path, f"# time x y z qx qy qz qw: scanner to world\n{tum_text(times_s, to_world)}")
-
-
 def _show(figures: dict[str, dict[str, float]], console: Console) -> None:
     """Print how true scans are."""
     if not figures:
         say(console, "No sweep and no beam is held out, so nothing says how true the scans are.", "yellow")
         return
     for name, found in figures.items():
+        what = f"Held-out {name}" if name in ("sweeps", "beams") else "Of these, inside a picture of their frame"
         text = (
-            f"{_WORDS[name]}, {found['rays']:,.0f} rays: the rendered distance is off by "
+            f"{what}, {found['rays']:,.0f} rays: the rendered distance is off by "
             f"{100 * found['median_m']:.1f} cm (median) and {found['p95_m']:.2f} m (95 %); {found['within_10_cm']:.1%} "
             f"are within 10 cm, {found['within_30_cm']:.1%} within 30 cm."
         )

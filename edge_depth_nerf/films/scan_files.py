@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32, Int16
 from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 
-from edge_depth_nerf.base.files import write_bytes
+from edge_depth_nerf.base.files import pcd_bytes, write_bytes
 from edge_depth_nerf.lidar.ply import ply_bytes
 from edge_depth_nerf.lidar.scans import ScanFormat, read_scan
 
@@ -38,25 +38,6 @@ def _records(scan: Scan) -> NDArray:
     return unstructured_to_structured(np.column_stack(columns), np.dtype(kinds))
 
 
-def _pcd(scan: Scan) -> bytes:
-    rows = _records(scan)
-    kinds = [rows.dtype[name] for name in rows.dtype.names or ()]
-    header = [
-        "# .PCD v0.7",
-        "VERSION 0.7",
-        f"FIELDS {' '.join(rows.dtype.names or ())}",
-        f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}",
-        f"TYPE {' '.join(kind.kind.upper() for kind in kinds)}",
-        f"COUNT {' '.join('1' for _ in kinds)}",
-        f"WIDTH {len(rows)}",
-        "HEIGHT 1",
-        "VIEWPOINT 0 0 0 1 0 0 0",
-        f"POINTS {len(rows)}",
-        "DATA binary\n",
-    ]
-    return "\n".join(header).encode() + rows.tobytes()
-
-
 def _bin(scan: Scan) -> bytes:
     intensity = np.zeros(len(scan.ring), np.float32) if scan.intensity is None else scan.intensity
     return np.column_stack((scan.points_m, intensity)).astype("<f4").tobytes()
@@ -64,7 +45,7 @@ def _bin(scan: Scan) -> bytes:
 
 _WRITERS: dict[str, Callable[[Scan], bytes]] = {
     "ply": lambda scan: ply_bytes(_records(scan)),
-    "pcd": _pcd,
+    "pcd": lambda scan: pcd_bytes(_records(scan)),
     "bin": _bin,
 }
 

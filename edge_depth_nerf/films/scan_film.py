@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable
 from io import BytesIO
 from pathlib import Path
 
@@ -42,25 +41,15 @@ def draw_scan(points_m: Float[np.ndarray, "points 3"]) -> UInt8[np.ndarray, "h w
     return canvas
 
 
-@dataclass
-class ScanFilm:
-    """Gathers the frames of a film."""
-
-    seconds: float
-    """Between two frames."""
-    frames: list[bytes] = field(default_factory=list)
-    """As WebP, so that a long film needs little memory."""
-
-    def add(self, points_m: Float[np.ndarray, "points 3"]) -> None:
-        """Add a scan; points in the scanner's frame."""
+def write_film(path: Path, scans_m: Iterable[Float[np.ndarray, "points 3"]], seconds: float) -> None:
+    """Write a film of scans, points in the scanner's frame, with so many seconds between two; atomically."""
+    pictures = []
+    for points_m in scans_m:
+        # as WebP, so that a long film needs little memory
         made = BytesIO()
         Image.fromarray(draw_scan(points_m)).save(made, "WEBP", quality=90)
-        self.frames.append(made.getvalue())
-
-    def write(self, path: Path) -> None:
-        """Write the film, atomically."""
-        pictures: Sequence[Image.Image] = [Image.open(BytesIO(frame)) for frame in self.frames]
-        made = BytesIO()
-        options = {"append_images": pictures[1:], "duration": round(1000 * self.seconds), "loop": 0, "quality": 80}
-        pictures[0].save(made, "WEBP", save_all=True, **options)
-        write_bytes(path, made.getvalue())
+        pictures.append(Image.open(made))
+    made = BytesIO()
+    options = {"append_images": pictures[1:], "duration": round(1000 * seconds), "loop": 0, "quality": 80}
+    pictures[0].save(made, "WEBP", save_all=True, **options)
+    write_bytes(path, made.getvalue())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,13 @@ from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.films.intensities import Intensities
+from edge_depth_nerf.films.scan_files import Scan
 from edge_depth_nerf.lidar.patterns import ScanPattern, pattern_of_scan
 from edge_depth_nerf.lidar.sweeps import MIN_RANGE_M
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.plugin.scanning import MOST_RAYS, Cast, Caster, errors, held_out_sweeps, in_pictures, some_of
 from edge_depth_nerf.scene.reader import SceneFolder
-from edge_depth_nerf.scene.sweeps import SceneScanner, SceneSweep, SweepRays
+from edge_depth_nerf.scene.sweeps import UNKNOWN_RING, SceneScanner, SceneSweep, SweepRays
 
 HIT = 0.5
 """A ray that stops less than this share of its light hits nothing."""
@@ -144,14 +146,33 @@ def chamfer_m(points_m: Float[np.ndarray, "points 3"], others_m: Float[np.ndarra
     return float(np.mean([way.mean() for way in ways]))
 
 
-def evaluate(
-    caster: Caster,
-    scene: SceneFolder,
-    scanner: SceneScanner,
-    pattern: ScanPattern | None,
-    ray_drop: RayDrop,
-    intensities: Intensities | None,
-) -> dict[str, dict[str, float]]:
+@dataclass(frozen=True, eq=False)
+class LearnedScanner:
+    """What is known of a drive's scanner in a trained scene; nothing but the scene if the drive has none."""
+
+    caster: Caster
+    pattern: ScanPattern | None = None
+    """Its own."""
+    ray_drop: RayDrop = field(default_factory=RayDrop)
+    intensities: Intensities | None = None
+
+    def render(self, pattern: ScanPattern, time_s: float, path: Trajectory) -> Scan:
+        """Render the scan of a pattern at `time_s` while the scanner moves along a path."""
+        cast, origins, directions = scan(self.caster, pattern, time_s, path)
+        # in the order of time: firing by firing
+        firing, ring = np.nonzero(self.ray_drop.kept(cast, pattern.reach_m).T)
+        distance_m = cast.distance_m[ring, firing][:, None]
+        intensity = None
+        if self.intensities is not None and len(ring):
+            # another scanner's rings say nothing
+            known = ring if pattern is self.pattern else np.full_like(ring, UNKNOWN_RING)
+            met_m = origins[firing] + directions[ring, firing] * distance_m
+            intensity = self.intensities.at(met_m, known, distance_m[:, 0])
+        points_m = (pattern.directions[ring, firing] * distance_m).astype(np.float32)
+        return Scan(points_m, pattern.offset_s[firing].astype(np.float32), ring.astype(np.int16), intensity)
+
+
+def evaluate(learned: LearnedScanner, scene: SceneFolder, scanner: SceneScanner) -> dict[str, dict[str, float]]:
     """Hold the model against what no training saw: held-out sweeps, and held-out beams of the others.
 
     Along each recorded ray, of at most `MOST_RAYS` a sweep, the rendered distance is compared with the measured one.
@@ -168,16 +189,16 @@ def evaluate(
     bright: list[tuple[NDArray, NDArray]] = []
     for kind, sweep, rays, counts in held_out_sweeps(scanner):
         chosen = some_of(counts)
-        both = rays.distance_m[chosen], caster.cast_at(rays, chosen)
+        both = rays.distance_m[chosen], learned.caster.cast_at(rays, chosen)
         shown = in_pictures(scene, sweep, rays)[chosen]
         for name, part in ((kind, slice(None)), (f"{kind}_in_pictures", shown)):
             lengths.setdefault(name, []).append((both[0][part], both[1][part]))
-        if intensities is not None and kind == "sweeps" and shown.any():
+        if learned.intensities is not None and kind == "sweeps" and shown.any():
             asked = chosen[shown]
             met_m = rays.origin_m[asked] + rays.direction[asked] * both[1][shown][:, None]
-            bright.append((rays.intensity[asked], intensities.at(met_m, rays.ring[asked], both[1][shown])))
-        if pattern is not None and kind == "sweeps":
-            more.append(_of_whole(caster, scanner.trajectory, sweep, rays, pattern, ray_drop))
+            bright.append((rays.intensity[asked], learned.intensities.at(met_m, rays.ring[asked], both[1][shown])))
+        if learned.pattern is not None and kind == "sweeps":
+            more.append(_of_whole(learned, learned.pattern, scanner.trajectory, sweep, rays))
     together = {name: tuple(map(np.concatenate, zip(*each, strict=True))) for name, each in lengths.items()}
     found = {name: errors(*both) for name, both in together.items() if len(both[0])}
     if bright:
@@ -192,15 +213,10 @@ def evaluate(
 
 
 def _of_whole(
-    caster: Caster,
-    scanner: Trajectory,
-    sweep: SceneSweep,
-    rays: SweepRays,
-    pattern: ScanPattern,
-    ray_drop: RayDrop,
+    learned: LearnedScanner, pattern: ScanPattern, scanner: Trajectory, sweep: SceneSweep, rays: SweepRays
 ) -> dict[str, float]:
-    cast, origins, directions = scan(caster, pattern, sweep.time_s, scanner)
-    kept = ray_drop.kept(cast, pattern.reach_m)
+    cast, origins, directions = scan(learned.caster, pattern, sweep.time_s, scanner)
+    kept = learned.ray_drop.kept(cast, pattern.reach_m)
     lost, truly = ~kept, ~came_back(sweep, rays, pattern, scanner)
     both = (lost & truly).sum()
     points_m = (origins[None] + directions * cast.distance_m[..., None])[kept]

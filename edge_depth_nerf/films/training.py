@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import types
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
-from edge_depth_nerf.base.bounds import finite, read_text, shown
+from edge_depth_nerf.base.bounds import read_text, shown
 from edge_depth_nerf.base.errors import InputError
 
 MAX_CONFIG_BYTES = 1 << 15
@@ -37,6 +36,7 @@ def read_dataparser(path: Path) -> Any:
         InputError: the file is not YAML, is not a training's config.yml, or has another dataparser.
     """
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+    from pydantic import ConfigDict, TypeAdapter, ValidationError
     from yaml import YAMLError
 
     from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig
@@ -62,15 +62,18 @@ def read_dataparser(path: Path) -> Any:
             "fisheye-depth-data or nerfstudio-data."
         )
     settings: dict[str, Any] = {}
-    hints = get_type_hints(known[name])
+    hints, strictly = get_type_hints(known[name]), ConfigDict(strict=True, allow_inf_nan=False)
     for field in dataclasses.fields(known[name]):
         found = _child(node, field.name)
         if found is None or field.name == "_target":
             continue
         value = _value(found)
-        if not _fits(value, hints[field.name]):
-            raise InputError(f"{path}: dataparser.{field.name} is {shown(value)}, which is not a valid value. {_HINT}.")
-        settings[field.name] = value
+        try:
+            settings[field.name] = TypeAdapter(hints[field.name], config=strictly).validate_python(value)
+        except ValidationError:
+            raise InputError(
+                f"{path}: dataparser.{field.name} is {shown(value)}, which is not a valid value. {_HINT}."
+            ) from None
     data = _value(_child(manager, "data"))
     return known[name](**{**settings, **({"data": data} if isinstance(data, Path) else {})})  # pyrefly: ignore
 
@@ -103,7 +106,7 @@ def _child(node: Any, key: str) -> Any:
 
 
 class _Unknown:
-    """Stands for a value that is neither plain nor a path."""
+    """Stands for a value that is neither plain nor a path, or a number larger than any setting."""
 
 
 def _value(node: Any) -> Any:
@@ -114,7 +117,8 @@ def _value(node: Any) -> Any:
         return None
     if node.id == "scalar" and not node.tag.startswith(_PYTHON):
         try:
-            return SafeConstructor().construct_object(node)
+            found = SafeConstructor().construct_object(node)
+            return _Unknown() if isinstance(found, int) and abs(found) >= 2**31 else found
         except (ConstructorError, ValueError):
             return _Unknown()
     if node.id != "sequence" or len(node.value) > 100 or any(item.id != "scalar" for item in node.value):
@@ -124,19 +128,3 @@ def _value(node: Any) -> Any:
         text = all(isinstance(item, str) and "\0" not in item for item in items)
         return Path(*items) if text else _Unknown()
     return tuple(items) if node.tag == f"{_PYTHON}tuple" else items
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value has the declared type."""
-    origin, inner = get_origin(hint), get_args(hint)
-    if origin is Literal:
-        return isinstance(value, str) and value in inner
-    if origin in (Union, types.UnionType):
-        return any(_fits(value, each) for each in inner)
-    if origin is tuple:
-        return isinstance(value, tuple) and len(value) == len(inner) and all(map(_fits, value, inner))
-    if hint is float:
-        return finite(value) is not None
-    if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**31
-    return type(value) is hint or (hint is Path and isinstance(value, Path))

@@ -14,7 +14,6 @@ from rich.table import Table
 
 from edge_depth_nerf import __version__
 from edge_depth_nerf.base.console import run_jobs, say
-from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import check_is_folder, read_json, write_json, write_png
 from edge_depth_nerf.base.pictures import drawn
 from edge_depth_nerf.inspecting.figures import (
@@ -122,15 +121,12 @@ def _sample(measured: int, pictures: int) -> str:
 def _open_output(output: Path) -> None:
     """Create the folder. Remove the sheets of an earlier inspection, which may be of another scene."""
     check_is_folder(output)
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        if (output / SUMMARY).is_file():
-            earlier = read_json(output / SUMMARY)
-            for name in earlier.get("sheets", ()) if isinstance(earlier, dict) else ():
-                if re.fullmatch(r"[\w.-]+\.png", str(name)):
-                    (output / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{output}: cannot be written ({error.strerror}). Give another --output.") from error
+    output.mkdir(parents=True, exist_ok=True)
+    if (output / SUMMARY).is_file():
+        earlier = read_json(output / SUMMARY)
+        for name in earlier.get("sheets", ()) if isinstance(earlier, dict) else ():
+            if re.fullmatch(r"[\w.-]+\.png", str(name)):
+                (output / name).unlink(missing_ok=True)
 
 
 def _sheet_name(picture: ScenePicture) -> str:

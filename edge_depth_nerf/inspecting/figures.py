@@ -28,6 +28,8 @@ KEPT_VALUES = 5000
 """This many values of a map are kept for medians over the drive."""
 STANDING_M = 0.05
 """Shorter steps are the jitter of a standing vehicle. The usual spacing is computed from the others."""
+COVERAGES = ("lidar_coverage", "mono_coverage", "motion_coverage", "prior_share")
+"""Shares of the usable pixels."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +65,7 @@ class PictureFigures:
             "file_path": self.picture.name,
             "camera": self.picture.camera,
             "frame": self.picture.frame,
-            "used_share": _rounded(self.used_share),
-            "brightness": _rounded(self.brightness),
-            "lidar_coverage": _rounded(self.lidar_coverage),
-            "mono_coverage": _rounded(self.mono_coverage),
-            "motion_coverage": _rounded(self.motion_coverage),
-            "prior_share": _rounded(self.prior_share),
+            **{name: _rounded(getattr(self, name)) for name in ("used_share", "brightness", *COVERAGES)},
             "mono_over_lidar_median": _median(self.mono_over_lidar),
         }
 
@@ -91,10 +88,9 @@ def measure(picture: ScenePicture, maps: ShownMaps) -> PictureFigures:
         chosen = values[where]
         return chosen[:: -(-len(chosen) // KEPT_VALUES) or 1]
 
-    def ratio(
-        above: NDArray[np.float32] | None, below: NDArray[np.float32] | None, where: NDArray[np.bool_]
-    ) -> NDArray[np.float32]:
-        return kept(above, where) / kept(below, where) if where.any() else np.empty(0, np.float32)
+    def ratio(above: NDArray[np.float32] | None, below: NDArray[np.float32] | None) -> NDArray[np.float32]:
+        where = at(above, below)
+        return kept(above, where) / kept(below, where)
 
     def share(distance_m: NDArray[np.float32] | None) -> float | None:
         return None if distance_m is None else float(at(distance_m).sum() / count)
@@ -113,8 +109,8 @@ def measure(picture: ScenePicture, maps: ShownMaps) -> PictureFigures:
         lidar_m=kept(maps.lidar_m, at(maps.lidar_m)),
         prior_m=kept(prior_m, at(prior_m)),
         sigma_m=kept(sigma_m, at(prior_m)),
-        mono_over_lidar=ratio(maps.mono_m, maps.lidar_m, at(maps.mono_m, maps.lidar_m)),
-        prior_over_truth=ratio(prior_m, maps.truth_m, at(prior_m, maps.truth_m)),
+        mono_over_lidar=ratio(maps.mono_m, maps.lidar_m),
+        prior_over_truth=ratio(prior_m, maps.truth_m),
     )
 
 
@@ -193,8 +189,8 @@ def path_figures(scene: SceneFolder) -> dict[str, Any]:
 def map_figures(measured: Sequence[PictureFigures]) -> dict[str, Any]:
     """Return the figures of several pictures together as JSON."""
 
-    def spread(values: Sequence[float | None]) -> dict[str, Any] | None:
-        known = [value for value in values if value is not None]
+    def spread(name: str) -> dict[str, Any] | None:
+        known = [value for figures in measured if (value := getattr(figures, name)) is not None]
         if not known:
             return None
         return {"mean": _rounded(np.mean(known)), "min": _rounded(min(known)), "max": _rounded(max(known))}
@@ -212,15 +208,12 @@ def map_figures(measured: Sequence[PictureFigures]) -> dict[str, Any]:
         return _rounded(np.abs(ratios - 1).mean()) if len(ratios) else None
 
     mono_over_lidar, prior_over_truth = pooled("mono_over_lidar"), pooled("prior_over_truth")
-    prior = spread([figures.prior_share for figures in measured])
+    prior = spread("prior_share")
     return {
         "measured_pictures": len(measured),
-        "used_share": spread([figures.used_share for figures in measured]),
-        "hidden_share_of_lens": spread([figures.hidden_share for figures in measured]),
-        "lidar_coverage": spread([figures.lidar_coverage for figures in measured]),
-        "mono_coverage": spread([figures.mono_coverage for figures in measured]),
-        "motion_coverage": spread([figures.motion_coverage for figures in measured]),
-        "prior_share": prior,
+        "used_share": spread("used_share"),
+        "hidden_share_of_lens": spread("hidden_share"),
+        **{name: spread(name) for name in COVERAGES},
         "no_prior_share": _rounded(1 - prior["mean"]) if prior else None,
         "lidar_distance_m": quantiles(pooled("lidar_m")),
         "prior_distance_m": quantiles(pooled("prior_m")),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import require
 
 LARGEST_PANEL_PX = 4000
 
@@ -31,7 +31,6 @@ class InspectOptions:
         Raises:
             InputError: an option is out of its range.
         """
-        if self.frames < 1:
-            raise InputError(f"--frames {self.frames}: expected 1 or more frames.")
-        if not 64 <= self.size <= LARGEST_PANEL_PX:
-            raise InputError(f"--size {self.size}: expected 64 to {LARGEST_PANEL_PX} px for the pictures of a sheet.")
+        require(self.frames >= 1, f"--frames {self.frames}", "1 or more frames")
+        within = 64 <= self.size <= LARGEST_PANEL_PX
+        require(within, f"--size {self.size}", f"64 to {LARGEST_PANEL_PX} px for the pictures of a sheet")

@@ -37,14 +37,7 @@ class Trajectory:
     vehicle_to_world: Float64[np.ndarray, "poses 4 4"]
 
     def __post_init__(self) -> None:
-        if len(self.times_s) < 2:
-            raise InputError(f"a path needs at least two poses for the vehicle's motion, found {len(self.times_s)}.")
-        if not (np.diff(self.times_s) > 0).all():
-            first = int(np.argmax(~(np.diff(self.times_s) > 0)))
-            raise InputError(
-                f"the times of a path must increase, but pose {first + 2} is of {self.times_s[first + 1]:.6f} s, the "
-                f"one before of {self.times_s[first]:.6f} s."
-            )
+        check_times(self.times_s)
 
     @cached_property
     def _screws(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -115,3 +108,15 @@ class Trajectory:
         start = torch.from_numpy(self.vehicle_to_world)
         rotation, position = start[:, :3, :3][index], start[:, :3, 3][index]
         return (rotation @ moved[:, :, None]).squeeze(-1) + position
+
+
+def check_times(times_s: Float64[np.ndarray, "poses"], of: str = "pose") -> None:
+    """Raise an InputError unless there are two times or more, and they increase."""
+    if len(times_s) < 2:
+        raise InputError(f"a path needs at least two {of}s for the vehicle's motion, found {len(times_s)}.")
+    if not (np.diff(times_s) > 0).all():
+        first = int(np.argmax(~(np.diff(times_s) > 0)))
+        raise InputError(
+            f"the times of a path must increase, but {of} {first + 2} is of {times_s[first + 1]:.6f} s, the one before "
+            f"of {times_s[first]:.6f} s."
+        )

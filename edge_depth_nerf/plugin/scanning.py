@@ -180,10 +180,7 @@ def points_within(
     picture: ScenePicture, usable: Bool[np.ndarray, "h w"], points_m: Float[np.ndarray, "points 3"]
 ) -> NDArray[np.intp]:
     """Give the numbers of the points that lie inside a picture's mask, hidden there or not."""
-    in_camera = (points_m - picture.position_m) @ picture.rotation * np.array([1.0, -1.0, -1.0])
-    pixels, valid = picture.lens.project(torch.from_numpy(in_camera))
-    inside = np.flatnonzero((valid & picture.lens.inside(pixels)).numpy())
-    column, row = pixels.numpy()[inside].astype(int).T
+    inside, row, column = picture.pixels_of(points_m)
     return inside[usable[row, column]]
 
 

@@ -113,7 +113,7 @@ def _pictures(report: Report) -> dict[str, object]:
             {
                 "title": drive.title,
                 "note": drive.note,
-                "points": None if drive.points is None else drive.points.data(),
+                "points": drive.points,
                 "methods": [name for name in report.methods if all(name in view.rendered for view in drive.views)],
                 "views": [
                     {

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8, UInt16
 from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.pictures import DISTANCE
@@ -20,41 +19,15 @@ STEPS = 65535
 """Number of steps that each axis is divided into."""
 
 
-@dataclass(frozen=True, eq=False)
-class ShownPoints:
-    """Points and cameras in the scene's metres: x and y level, z up."""
-
-    low_m: Float64[np.ndarray, "3"]
-    """The lowest corner of the points."""
-    step_m: Float64[np.ndarray, "3"]
-    """Length of one step along each axis."""
-    steps: UInt16[np.ndarray, "points 3"]
-    """Positions of the points, in steps from the lowest corner."""
-    colours: UInt8[np.ndarray, "points 3"]
-    """RGB from the pictures, or by height if the scene's cloud has no colours."""
-    paths_m: list[Float64[np.ndarray, "pictures 3"]]
-    """Positions of each camera's pictures, in order."""
-    training_m: Float64[np.ndarray, "trained 3"]
-    held_out_m: Float64[np.ndarray, "held 3"]
-    forward: Float64[np.ndarray, "3"]
-    """Direction from the first camera's first position to its last, or its viewing direction if it did not move."""
-
-    def data(self) -> dict[str, object]:
-        """Return the data for the page's script."""
-        return {
-            "low": self.low_m.tolist(),
-            "step": self.step_m.tolist(),
-            "steps": base64.b64encode(self.steps.astype("<u2").tobytes()).decode(),
-            "colours": base64.b64encode(self.colours.tobytes()).decode(),
-            "paths": [np.round(path, 2).tolist() for path in self.paths_m],
-            "training": np.round(self.training_m, 2).tolist(),
-            "heldOut": np.round(self.held_out_m, 2).tolist(),
-            "forward": np.round(self.forward, 3).tolist(),
-        }
-
-
-def show_points(scene: SceneFolder, most: int = MOST_POINTS) -> ShownPoints | None:
+def show_points(scene: SceneFolder, most: int = MOST_POINTS) -> dict[str, Any] | None:
     """Choose points of a scene at random; None for a scene without points.
+
+    Returns:
+        What the page's script takes. Lengths are metres in the scene, x and y level, z up. `low`: the lowest corner of
+        the points; `step`: the length of a step along each axis; `steps`: places in steps from there, uint16, and
+        `colours`: RGB from the pictures, or by height if the cloud has none, uint8, N×3 in base64. `paths`: places of
+        each camera's pictures, in order; `training`, `heldOut`: of those; `forward`: the direction from the first
+        camera's first place to its last, or its viewing direction if it did not move.
 
     Raises:
         InputError: the point cloud cannot be read.
@@ -85,13 +58,14 @@ def show_points(scene: SceneFolder, most: int = MOST_POINTS) -> ShownPoints | No
     forward = cameras[0][-1] - cameras[0][0]
     if np.linalg.norm(forward[:2]) < 0.1:
         forward = first[0].looks_along
-    return ShownPoints(
-        low_m=low_m,
-        step_m=step_m,
-        steps=np.rint((points_m - low_m) / step_m).clip(0, STEPS).astype(np.uint16),
-        colours=np.ascontiguousarray(shown),
-        paths_m=cameras,
-        training_m=places_m[~held_out],
-        held_out_m=places_m[held_out],
-        forward=forward / np.linalg.norm(forward),
-    )
+    steps = np.rint((points_m - low_m) / step_m).clip(0, STEPS).astype("<u2")
+    return {
+        "low": low_m.tolist(),
+        "step": step_m.tolist(),
+        "steps": base64.b64encode(steps.tobytes()).decode(),
+        "colours": base64.b64encode(shown.tobytes()).decode(),
+        "paths": [np.round(path, 2).tolist() for path in cameras],
+        "training": np.round(places_m[~held_out], 2).tolist(),
+        "heldOut": np.round(places_m[held_out], 2).tolist(),
+        "forward": np.round(forward / np.linalg.norm(forward), 3).tolist(),
+    }

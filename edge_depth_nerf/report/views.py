@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from rich.console import Console
 
 from edge_depth_nerf.base.console import run_jobs, say
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import encoded
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import (
     COLOUR_ERROR,
@@ -32,7 +34,7 @@ from edge_depth_nerf.base.pictures import (
 )
 from edge_depth_nerf.masks.regions import from_nearest
 from edge_depth_nerf.report.compared_views import ComparedView, compared_view, held_out_frames
-from edge_depth_nerf.report.points import MOST_POINTS, ShownPoints, show_points
+from edge_depth_nerf.report.points import MOST_POINTS, show_points
 from edge_depth_nerf.report.tables import Metric
 from edge_depth_nerf.scene.reader import read_scene
 
@@ -113,7 +115,8 @@ class ShownDrive:
     views: Sequence[ShownView]
     note: str
     """Which views these are, and what their ground truth is."""
-    points: ShownPoints | None = None
+    points: dict[str, Any] | None = None
+    """What `show_points` gives."""
 
 
 def views_of_a_drive(runs: int) -> int:
@@ -149,7 +152,7 @@ def make_drives(drives: Mapping[str, tuple[Path, Mapping[str, Path]]], console: 
     ]
 
 
-def _points(scene: Path, most: int, console: Console) -> ShownPoints | None:
+def _points(scene: Path, most: int, console: Console) -> dict[str, Any] | None:
     """Return the drive's points. If they cannot be read, the page only lacks its view in 3D."""
     try:
         return show_points(read_scene(scene), most)
@@ -249,18 +252,14 @@ def spread(
 
 def encode(pixels: NDArray[np.uint8], allowance: int) -> bytes:
     """Encode H×W×3 RGB as WebP. Reduce quality and size if it would exceed `allowance` bytes."""
-    encoded = np.zeros(0, np.uint8)
+    content = b""
     for share, quality in WEBP_QUALITIES:
         size = (max(round(pixels.shape[1] * share), 1), max(round(pixels.shape[0] * share), 1))
         smaller = pixels if share == 1 else resize(pixels, size)
-        ok, encoded = cv2.imencode(
-            ".webp", np.ascontiguousarray(smaller[..., ::-1]), [cv2.IMWRITE_WEBP_QUALITY, quality]
-        )
-        if not ok:
-            raise RuntimeError(f"WebP encoding failed for {smaller.dtype} {smaller.shape}")
-        if len(encoded) <= allowance:
+        content = encoded(".webp", smaller, [cv2.IMWRITE_WEBP_QUALITY, quality])
+        if len(content) <= allowance:
             break
-    return encoded.tobytes()
+    return content
 
 
 def data_uri(content: bytes, media_type: str) -> str:
@@ -270,11 +269,9 @@ def data_uri(content: bytes, media_type: str) -> str:
 
 def legend(scale: ColourScale) -> dict[str, object]:
     """Return the data of a scale's legend: a bar of its colours, ticks, and the colour of missing values."""
-    ok, bar = cv2.imencode(".png", np.ascontiguousarray(scale.colours[None, :, ::-1]))
-    assert ok
     places = scale.position(np.array(scale.ticks, float))
     return {
-        "bar": data_uri(bar.tobytes(), "image/png"),
+        "bar": data_uri(encoded(".png", scale.colours[None]), "image/png"),
         "ticks": [[round(float(place), 4), f"{tick:g}"] for place, tick in zip(places, scale.ticks, strict=True)],
         "unit": scale.unit,
         "none": "#{:02x}{:02x}{:02x}".format(*NO_VALUE_RGB),

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError, found_in
@@ -83,6 +84,14 @@ class ScenePicture:
     def pose(self) -> Transform:
         """Camera (OpenCV: x right, y down, z forward) to scene."""
         return opencv_to_opengl(rigid(self.rotation, self.position_m))
+
+    def pixels_of(self, points_m: Float[np.ndarray, "points 3"]) -> tuple[NDArray, NDArray, NDArray]:
+        """Numbers of the points in the scene that lie in the picture, hidden ones included; their rows and columns."""
+        in_camera = (points_m - self.position_m) @ self.rotation * np.array([1.0, -1.0, -1.0])
+        pixels, valid = self.lens.project(torch.from_numpy(in_camera))
+        seen = np.flatnonzero((valid & self.lens.inside(pixels)).numpy())
+        column, row = pixels.numpy()[seen].astype(int).T
+        return seen, row, column
 
     @property
     def looks_along(self) -> Float64[np.ndarray, "3"]:

@@ -21,10 +21,7 @@ Frame i is held out if i % 8 == 4. World coordinates are metres, z up, with an o
 
 from __future__ import annotations
 
-import dataclasses
 import logging
-from collections.abc import Iterator
-from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +29,19 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from edge_depth_nerf.base.console import progress_bars
+from edge_depth_nerf.base.console import in_turn
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import check_is_folder, read_json, write_json, write_mask, write_text
+from edge_depth_nerf.base.files import (
+    open_folder,
+    read_json_object,
+    remove_leftovers,
+    write_json,
+    write_mask,
+    write_text,
+)
 from edge_depth_nerf.cameras.transforms import rigid
 from edge_depth_nerf.synthetic import rig
-from edge_depth_nerf.synthetic.layout import WORLD_ORIGIN_M, DriveLayout, MountedCamera
+from edge_depth_nerf.synthetic.layout import WORLD_ORIGIN_M, DriveLayout, MountedCamera, held_out
 from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 from edge_depth_nerf.synthetic.rig_drive import RIG_FILE_LAYOUTS
@@ -46,18 +50,9 @@ VERSION = 1
 """Version of what is synthesised: drives of different versions do not mix in one folder."""
 
 _MANIFEST = "drive.json"
-_FIRST_TIME = datetime(2013, 5, 28, 8, 46, 2)
-_FIRST_NANOSECONDS = 123_456_789
-
-Job = tuple[int, str | None]
-"""A frame, and a camera; None = its sweep."""
+_FIRST_TIME = np.datetime64("2013-05-28T08:46:02.123456789")
 
 _log = logging.getLogger(__name__)
-
-
-def held_out(frame: int) -> bool:
-    """Whether a frame is for evaluation, not for training."""
-    return frame % 8 == 4
 
 
 _ONCE_ONLY: dict[str, Any] = {"layout": "kitti-360", "shifts_m": [1.0, 2.0]}
@@ -65,10 +60,10 @@ _ONCE_ONLY: dict[str, Any] = {"layout": "kitti-360", "shifts_m": [1.0, 2.0]}
 
 
 def _manifest(options: SynthesizeOptions) -> dict[str, Any]:
-    fields: dict[str, Any] = dataclasses.asdict(options)
-    del fields["output"]
-    fields["shifts_m"] = [float(shift_m) for shift_m in options.shifts_m]
-    fields = {name: value for name, value in fields.items() if _ONCE_ONLY.get(name) != value}
+    fields: dict[str, Any] = {name: getattr(options, name) for name in ("scene", "frames", "size", "seed")}
+    fields["moving"] = 0  # drives could have more cars once
+    given = {"shifts_m": [float(shift_m) for shift_m in options.shifts_m], "layout": options.layout}
+    fields |= {name: value for name, value in given.items() if _ONCE_ONLY[name] != value}
     fields |= {"speed_m_s": options.mean_speed_m_s, "sequence": options.sequence}
     return {
         "kind": "synthetic drive",
@@ -86,42 +81,20 @@ def _open_folder(options: SynthesizeOptions) -> None:
         InputError: it holds something else.
     """
     folder, manifest = options.output, _manifest(options)
-    check_is_folder(folder)
     path = folder / _MANIFEST
-    if path.is_file():
-        there = read_json(path)
-        if there != manifest:
-            given = there.get("options", {}) if isinstance(there, dict) else {}
-            old, new = ({**_ONCE_ONLY, **options} for options in (given, manifest["options"]))
-            changed = [
-                f"{name} is {old.get(name)!r} there and {new.get(name)!r} here"
-                for name in dict.fromkeys((*new, *old))
-                if old.get(name) != new.get(name)
-            ]
-            raise InputError(
-                f"{folder}: contains a drive with other options ({'; '.join(changed) or 'made by another version'}). "
-                "Choose another --output, or the same options to continue it."
-            )
-        # what an interrupted run was about to write
-        for left_over in folder.rglob(".*"):
-            if left_over.suffix in (".png", ".bin", ".pcd", ".txt", ".json", ".yaml", ".toml"):
-                left_over.unlink()
-    elif folder.is_dir() and any(folder.iterdir()):
-        names = sorted(entry.name for entry in folder.iterdir())
+    if path.is_file() and (there := read_json_object(path)) != manifest:
+        old, new = ({**_ONCE_ONLY, **found.get("options", {})} for found in (there, manifest))
+        changed = [
+            f"{name} is {old.get(name)!r} there and {new.get(name)!r} here"
+            for name in {**new, **old}
+            if old.get(name) != new.get(name)
+        ]
         raise InputError(
-            f"{folder}: contains something that is not a synthetic drive ({', '.join(names[:5])}"
-            f"{', ...' if len(names) > 5 else ''}). Choose a new or empty folder as --output."
+            f"{folder}: contains a drive with other options ({'; '.join(changed) or 'made by another version'}). "
+            "Choose another --output, or the same options to continue it."
         )
-    write_json(path, manifest)
-
-
-def _timestamps(frames: int) -> str:
-    lines = []
-    for frame in range(frames):
-        nanoseconds = _FIRST_NANOSECONDS + frame * round(FRAME_INTERVAL_S * 1e9)
-        stamp = _FIRST_TIME + timedelta(seconds=nanoseconds // 10**9)
-        lines.append(f"{stamp:%Y-%m-%d %H:%M:%S}.{nanoseconds % 10**9:09d}\n")
-    return "".join(lines)
+    open_folder(folder, path, manifest, "drives")
+    remove_leftovers(folder)
 
 
 def _row(frame: int, matrix: NDArray[np.float64]) -> str:
@@ -135,50 +108,39 @@ class _Kitti360(DriveLayout):
         mounted = {
             name: MountedCamera(rig.camera(name, options.size), rig.CAMERA_TO_POSE[name]) for name in rig.CAMERAS
         }
-        super().__init__(options, mounted)
-        self._pictures = self.root / "data_2d_raw" / options.sequence
-        self._scans = self.root / "data_3d_raw" / options.sequence / "velodyne_points"
-        self._truth = self.root / "truth" / options.sequence
-        self.last_file = self._truth / "shifted.json"
-
-    def picture(self, name: str, frame: int) -> Path:
-        return self._pictures / name / "data_rgb" / f"{frame:010d}.png"
-
-    def scan(self, frame: int) -> Path:
-        return self._scans / "data" / f"{frame:010d}.bin"
-
-    def map(self, kind: str, name: str, frame: int) -> Path:
-        mono = self.root / "simulated_mono" / self.options.sequence / name
-        folder = mono if kind == "mono" else self._truth / name / kind.removeprefix("truth_")
-        return folder / f"{frame:010d}.png"
-
-    def true_points(self, frame: int) -> Path:
-        return self._truth / "points" / f"{frame:010d}.bin"
-
-    def moving_mask(self, name: str, frame: int) -> Path | None:
-        return self._truth / "moving_masks" / name / f"{frame:010d}.png" if self.options.has_movers else None
-
-    def shifted(self, name: str, frame: int) -> dict[float, tuple[Path, Path]]:
-        shifts_m = self.options.shifts_m if held_out(frame) else ()
-        folders = {metres: self._truth / name / f"shifted_{metres:g}m" for metres in shifts_m}
-        file = f"{frame:010d}.png"
-        return {metres: (folder / "rgb" / file, folder / "distance" / file) for metres, folder in folders.items()}
+        truth = "truth/{sequence}/{name}"
+        paths = {
+            "picture": "data_2d_raw/{sequence}/{name}/data_rgb/{frame:010d}.png",
+            "mono": "simulated_mono/{sequence}/{name}/{frame:010d}.png",
+            "truth_distance": truth + "/distance/{frame:010d}.png",
+            "truth_rgb": truth + "/rgb/{frame:010d}.png",
+            "moving_mask": "truth/{sequence}/moving_masks/{name}/{frame:010d}.png",
+            "scan": "data_3d_raw/{sequence}/velodyne_points/data/{frame:010d}.bin",
+            "true_points": "truth/{sequence}/points/{frame:010d}.bin",
+        }
+        for shift_m in options.shifts_m:
+            for kind in ("rgb", "distance"):
+                paths[f"shifted_{shift_m:g}_{kind}"] = f"{truth}/shifted_{shift_m:g}m/{kind}/{{frame:010d}}.png"
+        super().__init__(options, mounted, paths)
+        self.last_file = self.root / "truth" / options.sequence / "shifted.json"
 
     def write_once(self) -> None:
-        frames = range(self.options.frames)
-        rig.write_calibration(self.root / "calibration", self.options.size)
-        for folder in (*(self._pictures / name for name in self.cameras), self._scans):
-            write_text(folder / "timestamps.txt", _timestamps(self.options.frames))
+        root, sequence, frames = self.root, self.options.sequence, range(self.options.frames)
+        rig.write_calibration(root / "calibration", self.options.size)
+        times = _FIRST_TIME + np.array(frames) * np.timedelta64(round(FRAME_INTERVAL_S * 1e9), "ns")
+        pictures, scans = root / "data_2d_raw" / sequence, root / "data_3d_raw" / sequence
+        for folder in (*(pictures / name for name in self.cameras), scans / "velodyne_points"):
+            write_text(folder / "timestamps.txt", "".join(f"{time}\n" for time in times).replace("T", " "))
         to_world = rigid(np.eye(3), WORLD_ORIGIN_M)
         poses = to_world @ self.drive.pose_to_world(np.array(frames) * FRAME_INTERVAL_S)
-        folder = self.root / "data_poses" / self.options.sequence
+        folder = root / "data_poses" / sequence
         write_text(folder / "poses.txt", "".join(_row(frame, poses[frame][:3]) for frame in frames))
         cam0 = rig.CAMERA_TO_POSE["image_00"]
         write_text(folder / "cam0_to_world.txt", "".join(_row(frame, poses[frame] @ cam0) for frame in frames))
         for name, camera in self.views.items():
             masks = {"_lens": camera.lens, "_ego": ~camera.own_car, "": camera.lens & ~camera.own_car}
             for kind, mask in masks.items():
-                write_mask(self.root / "truth" / "masks" / f"{name}{kind}.png", mask)
+                write_mask(root / "truth" / "masks" / f"{name}{kind}.png", mask)
         shifted = {
             f"{metres:g}": {
                 name: {
@@ -204,23 +166,15 @@ def synthesize_drive(options: SynthesizeOptions) -> Path:
     options.check()
     _open_folder(options)
     drive = {"kitti-360": _Kitti360, **RIG_FILE_LAYOUTS}[options.layout](options)
-    jobs: list[Job] = [(frame, name) for frame in range(options.frames) for name in (None, *drive.cameras)]
-    missing = [job for job in jobs if not all(path.is_file() for path in drive.files(*job))]
+    # of each frame its scan, then its pictures
+    jobs = [(frame, name) for frame in range(options.frames) for name in (None, *drive.cameras)]
+    missing = [job for job in jobs if not all(path.is_file() for path in drive.files(*job).values())]
     if not missing and drive.last_file.is_file():
         _log.info("%s: complete", options.output)
         return options.output
     with Console().status(f"Building the {options.scene} …"):
         drive.build()
         drive.write_once()
-    for job in shown(missing, options):
+    for job in in_turn(missing, f"{options.scene}: pictures and sweeps", Console()):
         drive.write(*job)
     return options.output
-
-
-def shown(missing: list[Job], options: SynthesizeOptions) -> Iterator[Job]:
-    """Go through what is to be made, and show how far it is."""
-    with progress_bars(Console(), counted=True) as progress:
-        task = progress.add_task(f"{options.scene}: pictures and sweeps", total=len(missing))
-        for job in missing:
-            yield job
-            progress.advance(task)

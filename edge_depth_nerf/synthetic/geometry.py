@@ -60,9 +60,7 @@ class Geometry:
 def flat_normals(corners: NDArray[np.float64]) -> NDArray[np.float32]:
     """Unit normals of F×3×3 triangles, F×3; zero for one without area."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normal = np.empty_like(a)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        normal[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
+    normal = np.cross(a, b)
     return (normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)).astype(np.float32)
 
 
@@ -80,19 +78,17 @@ class MeshBuilder:
     def __init__(self) -> None:
         self._parts: list[Geometry] = []
         # scenes have tens of thousands of small flat shapes: gathered first, made into arrays once
-        self._flat: list[NDArray[np.float64]] = []
-        self._flat_material: list[Material] = []
-        self._flat_tint: list[Colour] = []
+        self._flat: list[tuple[NDArray[np.float64], Material, Colour]] = []
 
     def build(self) -> Geometry:
         """All that was added."""
         if not self._flat:
             return Geometry.joined(self._parts)
-        counts = [len(corners) for corners in self._flat]
-        corners = np.concatenate(self._flat)
+        parts, materials, tints = zip(*self._flat, strict=True)
+        counts, corners = list(map(len, parts)), np.concatenate(parts)
         normals = np.repeat(flat_normals(corners)[:, None], 3, axis=1)
-        material = np.repeat(np.array(self._flat_material, np.uint8), counts)
-        tint = np.repeat(np.array(self._flat_tint, np.float32), counts, axis=0)
+        material = np.repeat(np.array(materials, np.uint8), counts)
+        tint = np.repeat(np.array(tints, np.float32), counts, axis=0)
         return Geometry.joined([*self._parts, Geometry(corners, normals, material, tint)])
 
     def add(self, geometry: Geometry, transform: NDArray | None = None) -> None:
@@ -103,9 +99,7 @@ class MeshBuilder:
         """Add F×3×3 corners; without normals (F×3×3) each triangle is flat."""
         corners = np.asarray(corners, np.float64)
         if normals is None:
-            self._flat.append(corners)
-            self._flat_material.append(material)
-            self._flat_tint.append(tint)
+            self._flat.append((corners, material, tint))
             return
         count = len(corners)
         tints = np.broadcast_to(np.asarray(tint, np.float32), (count, 3))

@@ -29,6 +29,9 @@ from edge_depth_nerf.synthetic.scenes import build_scene
 WORLD_ORIGIN_M = np.array([1200.0, 3700.0, 115.0])
 """Where the scene's origin lies in the world of the written poses."""
 
+FIRST_NS = 1_369_730_762_123_456_789
+"""Time of frame 0 in files that count nanoseconds."""
+
 PICTURE_NOISE = 2.0 / 255
 """Standard deviation of the sensor's noise, in picture values of 0-1."""
 
@@ -63,14 +66,31 @@ class MountedCamera:
     """How long after the frame's time it fires."""
 
 
+def held_out(frame: int) -> bool:
+    """Whether a frame is for evaluation, not for training."""
+    return frame % 8 == 4
+
+
 class DriveLayout(ABC):
     """A drive in one of the layouts. Before `build` it knows its files alone."""
 
     scanner: Scanner = HDL_64E
+    last_file: Path
+    """What `write_once` writes last: where it is, the others are."""
 
-    def __init__(self, options: SynthesizeOptions, cameras: Mapping[str, MountedCamera]) -> None:
-        """Lay out a drive that is seen by these cameras."""
+    def __init__(
+        self, options: SynthesizeOptions, cameras: Mapping[str, MountedCamera], paths: Mapping[str, str]
+    ) -> None:
+        """Lay out a drive that is seen by these cameras.
+
+        `paths` says where the files of a frame lie, by what they hold. With {name}, the camera's: `picture`, `mono`,
+        `truth_distance`, `truth_rgb`, and `moving_mask`, where a picture shows nothing that moves; and of held-out
+        frames ground truth as seen from so many metres to the car's left, `shifted_1_distance` and so on. Without:
+        `scan`, and `true_points`, the same without noise, moved to the frame's time.
+        """
         self.options, self.root, self.cameras = options, options.output, cameras
+        still = options.scene != "traffic"
+        self._paths = {kind: path for kind, path in paths.items() if not (still and kind == "moving_mask")}
 
     def build(self) -> None:
         """Build the scene, and what each camera sees of the own car."""
@@ -85,46 +105,15 @@ class DriveLayout(ABC):
             for name, mounted in self.cameras.items()
         }
 
-    # ---- where things lie ----------------------------------------------------------------------------------------
-
-    last_file: Path
-    """What `write_once` writes last: where it is, the others are."""
-
-    @abstractmethod
-    def picture(self, name: str, frame: int) -> Path:
-        """A picture."""
-
-    @abstractmethod
-    def scan(self, frame: int) -> Path:
-        """A scan."""
-
-    @abstractmethod
-    def map(self, kind: str, name: str, frame: int) -> Path:
-        """A map of a picture: its truth_distance, truth_rgb or mono."""
-
-    def true_points(self, frame: int) -> Path | None:
-        """A scan without noise, moved to the frame's time; None where the layout has none."""
-        return None
-
-    def moving_mask(self, name: str, frame: int) -> Path | None:
-        """Where a picture shows nothing that moves; None where the drive has none."""
-        return None
-
-    def shifted(self, name: str, frame: int) -> dict[float, tuple[Path, Path]]:
-        """Picture and distances as seen from some metres to the car's left; empty where the layout has none."""
-        return {}
-
-    def files(self, frame: int, name: str | None) -> list[Path]:
-        """All files of a frame's picture by the camera `name`, or of its scan."""
-        if name is None:
-            every = [self.scan(frame), self.true_points(frame)]
-        else:
-            every = [self.picture(name, frame), self.moving_mask(name, frame)]
-            every += [self.map(kind, name, frame) for kind in ("mono", "truth_distance", "truth_rgb")]
-            every += [path for pair in self.shifted(name, frame).values() for path in pair]
-        return [path for path in every if path is not None]
-
-    # ---- what is in them -----------------------------------------------------------------------------------------
+    def files(self, frame: int, name: str | None) -> dict[str, Path]:
+        """All files of a frame's picture by the camera `name`, or of its scan, by what they hold."""
+        given = {"frame": frame, "name": name, "sequence": self.options.sequence}
+        given["start_ns"] = FIRST_NS + round((frame - 0.5) * FRAME_INTERVAL_S * 1e9)
+        return {
+            kind: self.root / path.format(**given)
+            for kind, path in self._paths.items()
+            if ("{name}" in path) == (name is not None) and (held_out(frame) or not kind.startswith("shifted"))
+        }
 
     def scan_bytes(self, taken: Sweep) -> bytes:
         """A scan in the layout's own format: float32 x, y, z, reflectance."""
@@ -141,34 +130,33 @@ class DriveLayout(ABC):
 
     def write(self, frame: int, name: str | None) -> None:
         """Render and write a frame's picture by the camera `name` and its maps, or its scan."""
-        if name is not None:
-            self._write_picture(frame, name)
+        files, seed, world = self.files(frame, name), self.options.seed, self._world
+        if name is None:
+            rng = np.random.default_rng([seed, 20, frame])
+            swept = sweep(world, self.drive, frame * FRAME_INTERVAL_S, rng, self.scanner)
+            write_bytes(files["scan"], self.scan_bytes(swept))
+            if "true_points" in files:
+                write_bytes(files["true_points"], swept.deskewed.astype("<f4").tobytes())
             return
-        rng = np.random.default_rng([self.options.seed, 20, frame])
-        taken = sweep(self._world, self.drive, frame * FRAME_INTERVAL_S, rng, self.scanner)
-        write_bytes(self.scan(frame), self.scan_bytes(taken))
-        if path := self.true_points(frame):
-            write_bytes(path, taken.deskewed.astype("<f4").tobytes())
-
-    def _write_picture(self, frame: int, name: str) -> None:
-        number, camera, world = list(self.cameras).index(name), self.views[name], self._world
-        time_s, seed = frame * FRAME_INTERVAL_S + self.cameras[name].delay_s, self.options.seed
-        for metres, (picture, distance) in self.shifted(name, frame).items():
-            view = camera.view(world, self.camera_pose(name, time_s, metres), time_s, with_own_car=False)
-            write_png(picture, _to_bytes(world.to_picture(view.radiance)))
-            write_distance_png(distance, view.distance_m)
+        number, camera = list(self.cameras).index(name), self.views[name]
+        time_s = frame * FRAME_INTERVAL_S + self.cameras[name].delay_s
+        for metres in self.options.shifts_m:
+            if f"shifted_{metres:g}_rgb" in files:
+                view = camera.view(world, self.camera_pose(name, time_s, metres), time_s, with_own_car=False)
+                write_png(files[f"shifted_{metres:g}_rgb"], _to_bytes(world.to_picture(view.radiance)))
+                write_distance_png(files[f"shifted_{metres:g}_distance"], view.distance_m)
         view = camera.view(world, self.camera_pose(name, time_s), time_s)
-        write_distance_png(self.map("truth_distance", name, frame), view.distance_m)
-        write_png(self.map("truth_rgb", name, frame), _to_bytes(world.to_picture(view.radiance)))
-        if path := self.moving_mask(name, frame):
-            write_mask(path, ~view.moving)
+        write_distance_png(files["truth_distance"], view.distance_m)
+        write_png(files["truth_rgb"], _to_bytes(world.to_picture(view.radiance)))
+        if "moving_mask" in files:
+            write_mask(files["moving_mask"], ~view.moving)
         estimate = simulated_estimate(view.distance_m, camera.own_distance_m, camera.lens, frame, seed, number)
-        write_distance_png(self.map("mono", name, frame), estimate)
+        write_distance_png(files["mono"], estimate)
         # as the camera's sensor gives it, with exposure drift and noise
         taken = world.to_picture(view.radiance, _gain(seed, number, frame))
         rng = np.random.default_rng([seed, 31, number, frame])
         noise = rng.standard_normal(taken.shape, np.float32) * np.float32(PICTURE_NOISE)
-        write_png(self.picture(name, frame), _to_bytes(np.maximum(taken, _BLACK_LEVEL) + noise))
+        write_png(files["picture"], _to_bytes(np.maximum(taken, _BLACK_LEVEL) + noise))
 
 
 def _gain(seed: int, camera: int, frame: int) -> float:

@@ -25,21 +25,27 @@ _EASING_M = 3.0
 """Length over which the curvature of a turn goes from 0 to 1/radius, and back."""
 
 
+@dataclass(frozen=True)
+class Turn:
+    """A turn of a route."""
+
+    angle_rad: Real
+    """Signed: positive to the left."""
+    radius_m: Real
+    """Its smallest radius."""
+    straight_m: Real = 0.0
+    """Length of the straight stretch before it."""
+
+
 class Route:
     """A path on the ground: straight, or straight with one turn whose curvature rises and falls evenly."""
 
-    def __init__(
-        self,
-        start: Pair,
-        heading_rad: float = 0.0,
-        turn_rad: float = 0.0,
-        turn_at_m: float = 0.0,
-        radius_m: float = 8.0,
-    ) -> None:
-        """Lay out the route from x, y where the arc length is 0; the signed turn, 0 = none, has this least radius."""
+    def __init__(self, start: Pair, heading_rad: float = 0.0, turn: Turn | None = None) -> None:
+        """Lay out the route from x, y where the arc length is 0."""
+        turn_rad, radius_m = (turn.angle_rad, turn.radius_m) if turn else (0.0, 1.0)
         self._start, self._heading = np.asarray(start, np.float64), heading_rad
-        self._turn, self._turn_at = turn_rad, turn_at_m if turn_rad else np.inf
-        self.turn_length_m = abs(turn_rad) * radius_m + _EASING_M if turn_rad else 0.0
+        self._turn, self._turn_at = turn_rad, turn.straight_m if turn else np.inf
+        self.turn_length_m = abs(turn_rad) * radius_m + _EASING_M if turn else 0.0
         """Arc length of the turn with its easing."""
         s = np.arange(0, self.turn_length_m + _STEP_M, _STEP_M)
         curvature = np.minimum(1, np.minimum(s, self.turn_length_m - s).clip(0) / _EASING_M) / radius_m
@@ -64,18 +70,6 @@ class Route:
         return self._start + before[..., None] * first + bend + after[..., None] * last, self._heading + turned
 
 
-@dataclass(frozen=True)
-class Turn:
-    """A turn of a `WindingRoute`."""
-
-    angle_rad: Real
-    """Signed: positive to the left."""
-    radius_m: Real
-    """Its smallest radius."""
-    straight_m: Real = 0.0
-    """Length of the straight stretch before it."""
-
-
 class WindingRoute:
     """A path on the ground with several turns, one behind the other, as smooth as a `Route`."""
 
@@ -86,7 +80,7 @@ class WindingRoute:
         """Arc lengths where the turns end."""
         place, heading, passed = start, heading_rad, 0.0
         for turn in turns:
-            leg = Route(place, heading, float(turn.angle_rad), float(turn.straight_m), float(turn.radius_m))
+            leg = Route(place, heading, turn)
             length = float(turn.straight_m) + leg.turn_length_m
             places, headings = leg.at(np.array([length]))
             place, heading, passed = (float(places[0, 0]), float(places[0, 1])), float(headings[0]), passed + length

@@ -247,6 +247,10 @@ def recording_car() -> Geometry:
 # ------------------------------------------------------------------------------------------------- houses
 
 
+_Look = tuple[Material, Colour, Colour, Colour]
+"""Material and colour of walls, colours of doors and of window frames."""
+
+
 @dataclass(frozen=True)
 class _Opening:
     """A window or door in a wall, in the wall's own coordinates."""
@@ -257,32 +261,24 @@ class _Opening:
 
 
 def _wall(
-    mesh: MeshBuilder,
-    start: NDArray[np.float64],
-    end: NDArray[np.float64],
-    z: Pair,
-    openings: list[_Opening],
-    material: Material,
-    tint: Colour,
-    door: Colour,
-    frame: Colour,
-    rng: Generator,
+    mesh: MeshBuilder, start: NDArray, end: NDArray, height: Real, openings: list[_Opening], look: _Look, rng: Generator
 ) -> None:
     """An upright wall from start to end (x, y), outside on the right-hand side, with openings set back in it."""
+    material, tint, door, frame = look
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length
     outward = np.array([along[1], -along[0]])
 
     def point(u: Real, v: Real, depth: Real) -> Triple:
         x, y = start + along * u - outward * depth
-        return float(x), float(y), z[0] + v
+        return float(x), float(y), v
 
     def panel(u: Pair, v: Pair, depth: Real, kind: Material, colour: Colour) -> None:
         corners = ((u[0], v[0]), (u[1], v[0]), (u[1], v[1]), (u[0], v[1]))
         mesh.add_polygon([point(*corner, depth) for corner in corners], kind, colour)
 
     us = sorted({0.0, length, *(edge for o in openings for edge in o.u)})
-    vs = sorted({0.0, z[1] - z[0], *(edge for o in openings for edge in o.v)})
+    vs = sorted({0.0, height, *(edge for o in openings for edge in o.v)})
     for u0, u1 in pairwise(us):
         for v0, v1 in pairwise(vs):
             middle = ((u0 + u1) / 2, (v0 + v1) / 2)
@@ -382,7 +378,7 @@ def house(width: Real, depth: Real, rng: Generator, shop: bool = False) -> Geome
         openings = _openings(float(np.linalg.norm(end - start)), storeys, storey, side == 0, shop and side == 0, rng)
         if side % 2 and rng.random() < 0.3:
             openings = []
-        _wall(mesh, start, end, (0.0, height), openings, material, tint, door, frame, rng)
+        _wall(mesh, start, end, height, openings, (material, tint, door, frame), rng)
     mesh.add_box((width / 2, -0.02, 0.22), (width, 0.08, 0.44), Material.STONE, (0.28, 0.27, 0.25))
     if rng.random() < 0.5:
         for level in range(1, storeys):

@@ -6,9 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, get_args
 
-import tyro
-
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import InputError, require
 
 SceneName = Literal["street", "parking", "turn", "traffic", "roundabout"]
 LayoutName = Literal["kitti-360", "jbnu-depth360", "rig"]
@@ -24,7 +22,6 @@ MEAN_SPEED_M_S: dict[SceneName, float] = {
 
 
 _SIZE_RANGE_PX = (32, 4096)
-_MOVING_MAX = 8
 
 
 @dataclass(frozen=True)
@@ -44,18 +41,11 @@ class SynthesizeOptions:
     """Width and height of the pictures in pixels; KITTI-360's own are 1400."""
     seed: int = 0
     """Seed of everything random. Same options, same bytes."""
-    moving: tyro.conf.Suppress[int] = 0
-    """Number of other cars that drive through the scene; their masks are written as truth/<sequence>/moving_masks."""
     shifts_m: tuple[float, ...] = (1.0, 2.0)
     """kitti-360: distances to the left of the path from which true views are rendered, of every eighth frame, metres;
     negative to the right. `compare` evaluates methods by them."""
     layout: LayoutName = "kitti-360"
     """kitti-360: two fisheyes; jbnu-depth360: four fisheyes; rig: two fisheyes and a pinhole with a rig.toml."""
-
-    @property
-    def has_movers(self) -> bool:
-        """Whether anything but the recording car moves."""
-        return self.moving > 0 or self.scene == "traffic"
 
     @property
     def mean_speed_m_s(self) -> float:
@@ -72,14 +62,10 @@ class SynthesizeOptions:
             if (given := getattr(self, name)) not in get_args(choices):
                 expected = ", ".join(get_args(choices))
                 raise InputError(f"--{name} {given}: no such {name}, expected one of {expected}.")
-        if self.frames < 1:
-            raise InputError(f"--frames {self.frames}: expected at least 1.")
-        if not _SIZE_RANGE_PX[0] <= self.size <= _SIZE_RANGE_PX[1]:
-            raise InputError(f"--size {self.size}: expected {_SIZE_RANGE_PX[0]} to {_SIZE_RANGE_PX[1]} pixels.")
-        if self.seed < 0:
-            raise InputError(f"--seed {self.seed}: expected 0 or more.")
-        if not all(abs(shift_m) <= 99 and round(shift_m, 2) == shift_m for shift_m in self.shifts_m):
-            given = " ".join(map(str, self.shifts_m))
-            raise InputError(f"--shifts-m {given}: expected metres, -99 to 99, with at most two decimals.")
-        if not 0 <= self.moving <= _MOVING_MAX:
-            raise InputError(f"--moving {self.moving}: expected 0 to {_MOVING_MAX} driving cars.")
+        smallest, largest = _SIZE_RANGE_PX
+        require(self.frames >= 1, f"--frames {self.frames}", "at least 1")
+        require(smallest <= self.size <= largest, f"--size {self.size}", f"{smallest} to {largest} pixels")
+        require(self.seed >= 0, f"--seed {self.seed}", "0 or more")
+        fine = all(abs(shift_m) <= 99 and round(shift_m, 2) == shift_m for shift_m in self.shifts_m)
+        given = " ".join(map(str, self.shifts_m))
+        require(fine, f"--shifts-m {given}", "metres, -99 to 99, with at most two decimals")

@@ -27,26 +27,26 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from edge_depth_nerf.base.files import write_mask, write_text
+from edge_depth_nerf.base.files import pcd_bytes, write_mask, write_text
 from edge_depth_nerf.cameras import MEI, Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.cameras.transforms import rigid
-from edge_depth_nerf.synthetic.layout import VEHICLE_TO_POSE, WORLD_ORIGIN_M, DriveLayout, MountedCamera
+from edge_depth_nerf.synthetic.layout import FIRST_NS, VEHICLE_TO_POSE, WORLD_ORIGIN_M, DriveLayout, MountedCamera
 from edge_depth_nerf.synthetic.lidar import Scanner, Sweep
 from edge_depth_nerf.synthetic.motion import FRAME_INTERVAL_S
-from edge_depth_nerf.synthetic.options import LayoutName, SynthesizeOptions
+from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
 POSE_INTERVAL_S = 0.04
 """Time between the written poses; it does not fit the pictures'."""
 
-_FIRST_NS = 1_369_730_762_123_456_789
+_MAPS = {"mono": "mono/{name}", "truth_distance": "truth/{name}/distance", "truth_rgb": "truth/{name}/rgb"}
 _MODELS = {MEI: "mei", KannalaBrandt: "kannala-brandt", Pinhole: "pinhole"}
 
 
@@ -98,11 +98,6 @@ def _filled(camera: Camera, theta_deg: float) -> Camera:
     return replace(camera, fx=focal, fy=1.001 * focal)
 
 
-def _scanner_to_vehicle(yaw_deg: float, position_m: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Scanner to vehicle, 4×4."""
-    return rigid(Rotation.from_euler("z", yaw_deg, degrees=True).as_matrix(), position_m)
-
-
 class _RigFileLayout(DriveLayout):
     """What the layouts share that bring a rig file."""
 
@@ -110,17 +105,17 @@ class _RigFileLayout(DriveLayout):
     first_s = 0.0
     """Time of frame 0."""
 
+    def __init__(
+        self, options: SynthesizeOptions, cameras: dict[str, MountedCamera], rig_file: str, pictures: str, scan: str
+    ) -> None:
+        folders = {"picture": pictures, **_MAPS, "moving_mask": "truth/{name}/moving_masks"}
+        paths = {kind: f"{folder}/{{frame:06d}}.png" for kind, folder in folders.items()}
+        super().__init__(options, cameras, {**paths, "scan": scan})
+        self.last_file = self.root / rig_file
+
     @abstractmethod
     def description(self) -> str:
         """What the rig file says."""
-
-    def map(self, kind: str, name: str, frame: int) -> Path:
-        return self.root / _maps(name)[kind] / f"{frame:06d}.png"
-
-    def moving_mask(self, name: str, frame: int) -> Path | None:
-        # drives with --moving had none when this was added
-        wanted = self.options.scene == "traffic"
-        return self.root / "truth" / name / "moving_masks" / f"{frame:06d}.png" if wanted else None
 
     def write_once(self) -> None:
         for name, camera in self.views.items():
@@ -139,33 +134,19 @@ class _RigFileLayout(DriveLayout):
 class _Rig(_RigFileLayout):
     """The layout `rig`."""
 
-    first_s = _FIRST_NS / 1e9
-    scanner_to_vehicle = _scanner_to_vehicle(3.0, (0.8, 0.02, 0.84))
+    first_s = FIRST_NS / 1e9
+    scanner_to_vehicle: NDArray[np.float64] = rigid(
+        Rotation.from_euler("z", 3.0, degrees=True).as_matrix(), (0.8, 0.02, 0.84)
+    )
     scanner = Scanner.turning(12.0, -26.0, 48, 1200, VEHICLE_TO_POSE @ scanner_to_vehicle)
 
     def __init__(self, options: SynthesizeOptions) -> None:
-        super().__init__(options, rig_cameras(options.size))
-        self.last_file = self.root / "rig.toml"
-
-    def picture(self, name: str, frame: int) -> Path:
-        return self.root / "images" / name / f"{frame:06d}.png"
-
-    def scan(self, frame: int) -> Path:
-        start_ns = _FIRST_NS + round((frame - 0.5) * FRAME_INTERVAL_S * 1e9)
-        return self.root / "lidar" / f"{start_ns}.pcd"
+        super().__init__(options, rig_cameras(options.size), "rig.toml", "images/{name}", "lidar/{start_ns}.pcd")
 
     def scan_bytes(self, taken: Sweep) -> bytes:
         record = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4")]
-        points = np.empty(len(taken.raw), record)
-        for column, name in enumerate(("x", "y", "z", "intensity")):
-            points[name] = taken.raw[:, column]
-        points["t"] = np.rint((taken.offset_s + FRAME_INTERVAL_S / 2) * 1e9)
-        header = (
-            "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z intensity t\nSIZE 4 4 4 4 4\n"
-            f"TYPE F F F F U\nCOUNT 1 1 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
-            f"POINTS {len(points)}\nDATA binary\n"
-        )
-        return header.encode() + points.tobytes()
+        start_ns = np.rint((taken.offset_s + FRAME_INTERVAL_S / 2) * 1e9)
+        return pcd_bytes(unstructured_to_structured(np.column_stack((taken.raw, start_ns)), np.dtype(record)))
 
     def write_once(self) -> None:
         for name, mounted in self.cameras.items():
@@ -203,18 +184,12 @@ class _Rig(_RigFileLayout):
 class _JbnuDepth360(_RigFileLayout):
     """The layout `jbnu-depth360`."""
 
-    scanner_to_vehicle = _scanner_to_vehicle(0.0, (0.4, 0.0, 1.2))
+    scanner_to_vehicle: NDArray[np.float64] = rigid(np.eye(3), (0.4, 0.0, 1.2))
     scanner = Scanner.turning(45.0, -45.0, 32, 1024, VEHICLE_TO_POSE @ scanner_to_vehicle)
 
     def __init__(self, options: SynthesizeOptions) -> None:
-        super().__init__(options, jbnu_cameras(options.size))
-        self.last_file = self.root / "calibration.toml"
-
-    def picture(self, name: str, frame: int) -> Path:
-        return self.root / "image" / name / f"{frame:06d}.png"
-
-    def scan(self, frame: int) -> Path:
-        return self.root / "bin" / f"{frame:06d}.bin"
+        cameras = jbnu_cameras(options.size)
+        super().__init__(options, cameras, "calibration.toml", "image/{name}", "bin/{frame:06d}.bin")
 
     def description(self) -> str:
         text = '[poses]\nfile = "poses.txt"\n'
@@ -230,7 +205,7 @@ class _JbnuDepth360(_RigFileLayout):
 
 def _maps(name: str) -> dict[str, str]:
     """Folders of what comes with a camera's pictures, by its key in a rig file."""
-    return {"mono": f"mono/{name}", "truth_distance": f"truth/{name}/distance", "truth_rgb": f"truth/{name}/rgb"}
+    return {kind: folder.format(name=name) for kind, folder in _MAPS.items()}
 
 
 def _model(camera: Camera) -> dict[str, Any]:
@@ -258,8 +233,5 @@ def _toml(value: Any) -> str:
     return f'"{value}"' if isinstance(value, str) else f"{value:.12g}"
 
 
-RIG_FILE_LAYOUTS: dict[LayoutName, Callable[[SynthesizeOptions], DriveLayout]] = {
-    "rig": _Rig,
-    "jbnu-depth360": _JbnuDepth360,
-}
+RIG_FILE_LAYOUTS: dict[str, Callable[[SynthesizeOptions], DriveLayout]] = {"rig": _Rig, "jbnu-depth360": _JbnuDepth360}
 """The layouts with a rig file."""

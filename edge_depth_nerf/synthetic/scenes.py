@@ -249,44 +249,14 @@ _DAYLIGHT = Lighting(
 )
 
 
-def _movers(
-    options: SynthesizeOptions, own: Drive, oncoming: Route | None, oncoming_zero_m: Real, rng: Generator
-) -> list[Mover]:
-    """Cars that drive: by turns towards the recording car, meeting it during the drive, and ahead of it.
-
-    `oncoming_zero_m` is the arc length of the oncoming route where the recording car starts beside it. Without such a
-    route, cars drive by turns behind the recording car and ahead of it.
-    """
-    movers = []
-    speed, duration = options.mean_speed_m_s, options.frames * FRAME_INTERVAL_S
-    towards = (options.moving + 1) // 2
-    for number in range(options.moving):
-        geometry = objects.driven_car(rng)
-        if number % 2 == 0 and oncoming is not None:
-            meets_s = duration * (number // 2 + 0.5) / towards
-            its_speed = speed * rng.uniform(0.9, 1.1)
-            # both have the same place beside the road at the moment of meeting
-            start = oncoming_zero_m - speed * meets_s - its_speed * meets_s
-            movers.append(Mover(geometry, oncoming, start, its_speed))
-        else:
-            ahead = (9.0 + 9.0 * (number // 2)) * (1 if number % 2 else -1)
-            movers.append(Mover(geometry, own.route, own.start_m + ahead, speed))
-    return movers
-
-
 def _driven_through(
-    options: SynthesizeOptions,
-    site: _Site,
-    lighting: Lighting,
-    route: Route | WindingRoute,
-    oncoming: Route | None,
-    start_m: Real = 0.0,
+    options: SynthesizeOptions, site: _Site, lighting: Lighting, route: Route | WindingRoute, start_m: Real = 0.0
 ) -> SceneModel:
-    """The scene with the recording car on its route, from an arc length on, and the cars that drive."""
+    """The scene with the recording car on its route, from an arc length on, and what moves."""
     drive = Drive.random(route, start_m, options.mean_speed_m_s, np.random.default_rng([options.seed, 2]))
-    movers = _movers(options, drive, oncoming, -start_m, np.random.default_rng([options.seed, 3]))
+    movers = []
     if options.scene == "traffic":
-        movers += traffic(drive, options.frames * FRAME_INTERVAL_S, np.random.default_rng([options.seed, 4]))
+        movers = traffic(drive, options.frames * FRAME_INTERVAL_S, np.random.default_rng([options.seed, 4]))
     return SceneModel(site.mesh.build(), movers, lighting, site.contacts, drive)
 
 
@@ -316,7 +286,7 @@ def _street(options: SynthesizeOptions, length: Real, rng: Generator) -> SceneMo
         row = _Site()
         _houses(row, (-30.0, 26.0), rng)
         site.put_site(row, placement(end, 0, 0, yaw))
-    return _driven_through(options, site, _DAYLIGHT, Route((0.0, -1.75)), Route((0.0, 1.75), np.pi))
+    return _driven_through(options, site, _DAYLIGHT, Route((0.0, -1.75)))
 
 
 _CORNER_M = 4.0
@@ -341,7 +311,7 @@ def _crossing(mesh: MeshBuilder, near: Real) -> None:
 
 def _turn(options: SynthesizeOptions, length: Real, rng: Generator) -> SceneModel:
     straight = 15.0
-    route = Route((0.0, -1.75), turn_rad=-np.pi / 2, turn_at_m=straight)
+    route = Route((0.0, -1.75), 0.0, Turn(-np.pi / 2, 8.0, straight))
     # a drive too short for all of it has the turn in its middle
     start = max(0.0, straight + route.turn_length_m / 2 - length / 2)
     after, _ = route.at(np.array([straight + route.turn_length_m]))
@@ -375,7 +345,7 @@ def _turn(options: SynthesizeOptions, length: Real, rng: Generator) -> SceneMode
         _road_details(local.mesh, (inner + 4.5, reach), rng)
         _end(local, reach, rng)
         site.put_site(local, placement(centre_x, 0, 0, arm * np.pi / 2))
-    return _driven_through(options, site, _DAYLIGHT, route, Route((0.0, 1.75), np.pi), start)
+    return _driven_through(options, site, _DAYLIGHT, route, start)
 
 
 ISLAND_M = 7.5
@@ -545,7 +515,7 @@ def _roundabout(options: SynthesizeOptions, length: Real, rng: Generator) -> Sce
         # the first thing that those who come in by this arm see of the island
         _chevrons(middle, ISLAND_M - 0.6, arm * np.pi / 2 + 0.2)
     site.put_site(middle, placement(centre[0], centre[1]))
-    return _driven_through(options, site, _DAYLIGHT, route, None, start)
+    return _driven_through(options, site, _DAYLIGHT, route, start)
 
 
 _CEILING_M = 2.6
@@ -644,7 +614,7 @@ def _parking(options: SynthesizeOptions, length: Real, rng: Generator) -> SceneM
         lamp=(1.9, 2.0, 1.8),
         lamp_reach_m=8.0,
     )
-    return _driven_through(options, site, lighting, Route((0.0, -1.1)), Route((0.0, 1.6), np.pi))
+    return _driven_through(options, site, lighting, Route((0.0, -1.1)))
 
 
 _BUILDERS = {"street": _street, "traffic": _street, "turn": _turn, "parking": _parking, "roundabout": _roundabout}
