@@ -35,7 +35,8 @@ from edge_depth_nerf.report.build import Report, write_report
 from edge_depth_nerf.report.compared_views import compared_views
 from edge_depth_nerf.report.tables import latex_of_tables, page_of_tables, show_tables
 from edge_depth_nerf.report.views import REPORT
-from edge_depth_nerf.scene.format import DEPTH_KEY, LAYERS, layers_of, read_transforms
+from edge_depth_nerf.scene.format import LAYERS, TRANSFORMS
+from edge_depth_nerf.scene.reader import read_scene
 
 RECORD = "compare.json"
 RUNS = "runs"
@@ -160,20 +161,12 @@ def layers_digest(folder: Path) -> str:
     """SHA-256 of all files that a scene has beside its pictures: masks, maps, and what they are evaluated by.
 
     Other maps may have the names of those before, and then transforms.json does not change.
-
-    Raises:
-        FileNotFoundError: one of them is missing.
     """
-    keys = [*(layer.key for name, layer in LAYERS.items() if name != "image"), DEPTH_KEY]
-    transforms = folder / "transforms.json"
-    frames = read_transforms(transforms)["frames"]
+    maps = [(layer, path) for each in read_scene(folder).pictures for layer, path in each.files.items()]
     digest = hashlib.sha256()
-    for name in sorted({frame[key] for frame in frames for key in keys if isinstance(frame.get(key), str)}):
-        path = folder / name
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file, but {transforms} names it. Process the drive again.")
+    for name in sorted({path.relative_to(folder).as_posix() for layer, path in maps if layer != "image"}):
         digest.update(f"{name}\n".encode())
-        digest.update(bytes.fromhex(sha256_of(path)))
+        digest.update(bytes.fromhex(sha256_of(folder / name)))
     return digest.hexdigest()
 
 
@@ -185,23 +178,18 @@ def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> str
 
     Raises:
         FileNotFoundError: there is no scene.
-        InputError: it has no split, or lacks the maps that a method needs.
+        InputError: it is broken, has no split, or lacks the maps that a method needs.
     """
-    path = folder / "transforms.json"
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{path}: no such file. compare takes scene folders; `edge-depth-nerf process` makes one from a raw drive."
-        )
-    meta = read_transforms(path)
-    frames, held_out = meta["frames"], meta.get("test_filenames") or []
-    if not held_out or set(held_out) & set(meta.get("train_filenames", [])):
+    path = folder / TRANSFORMS
+    scene = read_scene(path)
+    held_out = scene.meta.get("test_filenames") or []
+    if not held_out or set(held_out) & set(scene.meta.get("train_filenames", [])):
         raise InputError(
             f"{path}: found {len(held_out)} pictures under test_filenames that are not training pictures; expected "
             "at least one for evaluation. Process the drive with --holdout-every 2 or more."
         )
-    has = layers_of(frames[0])
     for name in methods:
-        missing = [source for source in METHODS[name].needs if source not in has]
+        missing = [source for source in METHODS[name].needs if not scene.has(source)]
         if missing:
             remedies = " and ".join(REMEDIES[source] for source in missing).capitalize()
             raise InputError(

@@ -111,14 +111,6 @@ _MAY_BE_NULL = ("timestamp_s", "fisheye_crop_radius")
 _ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 
-def is_own_scene(meta: Mapping[str, Any]) -> bool:
-    """Whether a scene was written by `process`: its lengths are metres, its maps distances along the ray.
-
-    Monocular maps say nothing about that: `estimate-depth` puts them into other people's scenes, too.
-    """
-    return "world_offset_m" in meta or LAYERS["lidar"].key in meta["frames"][0]
-
-
 def read_transforms(path: Path) -> dict[str, Any]:
     """Read a transforms.json whose frames have pictures and whose values are what they are taken for.
 

@@ -40,7 +40,6 @@ from edge_depth_nerf.scene.format import (
     LAYERS,
     TRANSFORMS,
     DepthKind,
-    is_own_scene,
     number_of,
     path_keys,
     pose_of,
@@ -346,8 +345,9 @@ def scene_of(
             f"{path}: camera_model is {model!r}; expected one of {', '.join((*PINHOLE_MODELS, FISHEYE_MODEL))}. "
             "Convert the cameras, for example with `edge-depth-nerf process`."
         )
-    own = is_own_scene(meta)
     own_lidar = LAYERS["lidar"].key in frames[0]
+    # monocular maps say nothing about that: `estimate-depth` puts them into other people's scenes, too
+    own = own_lidar or "world_offset_m" in meta
     held_out, split_known = _held_out(meta)
     numbers = _frame_numbers(frames)
     pictures = [
