@@ -480,7 +480,7 @@ SKEWED[0, 0] = 1.01
         ({"given": bad({"cloud": NO_POINTS})}, "no LiDAR point lies in any training picture"),
         ({"given": bad({"lidar": HALF})}, "its LiDAR map: 16×32 pixels, expected 32×32"),
         ({"given": bad({"mono": HALF})}, "its monocular map: 16×32 pixels, expected 32×32"),
-        ({"given": bad({"image": np.zeros((8, 9, 3), np.uint8)})}, "the picture: 9×8 pixels, expected 32×32"),
+        ({"given": bad({"image": np.zeros((8, 9, 3), np.uint8)})}, "its picture: 9×8 pixels, expected 32×32"),
         ({"given": bad({"mask": HALF > 0}), "layers": ("lidar", "mask")}, "its mask: 16×32 pixels"),
         ({"mask": HALF > 0}, "mask of camera image_02: 16×32 pixels, expected 32×32"),
         ({"mask": np.zeros((SIZE, SIZE), bool)}, "mask of camera image_02 leaves no pixel.*inverted"),
