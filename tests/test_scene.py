@@ -352,12 +352,12 @@ def test_cloud_is_thinned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def test_one_point_of_each_cube(seed: int, voxel_m: float) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-4, 4, (300, 3)).astype(np.float32)
-    part = points_module._Part(points, rng.integers(0, 256, (300, 3), dtype=np.uint8))
+    part = points, rng.integers(0, 256, (300, 3), dtype=np.uint8)
     cells = {tuple(cell) for cell in np.floor(points / voxel_m).astype(int)}
-    thinned = points_module._thinned([part], voxel_m)
-    assert {tuple(cell) for cell in np.floor(thinned.points_m / voxel_m).astype(int)} == cells
-    assert len(thinned.points_m) == len(cells)
-    assert np.array_equal(points_module._thinned([thinned], voxel_m).points_m, thinned.points_m)
+    thinned, _ = points_module._thinned([part], voxel_m, 300)
+    assert {tuple(cell) for cell in np.floor(thinned[0] / voxel_m).astype(int)} == cells
+    assert len(thinned[0]) == len(cells)
+    assert np.array_equal(points_module._thinned([thinned], voxel_m, 300)[0][0], thinned[0])
 
 
 # ---- interrupted, and run again --------------------------------------------------------------------------------

@@ -289,8 +289,13 @@ def write_scene(
     left_out = {(item.camera, item.frame) for item in tolerance.left_out}
     frames = [frame for frame in frames if (frame.camera, frame.frame) not in left_out]
     _check_split(frames)
-    if work.cloud:
-        _write_cloud(output, frames)
+    if work.cloud and not merge_parts(
+        [output / _cloud_path(frame) for frame in frames if not frame.held_out], output / POINTS
+    ):
+        raise InputError(
+            f"{output}: no LiDAR point lies in any training picture. Check the calibration from the scanner to "
+            "the cameras, and the masks (255 = use the pixel)."
+        )
     content = _transforms(cameras, fits, frames, shifted, layers, offset, theta_max_deg, source)
     if scanners:
         content[SCANNERS] = {scanner.name: scanner.entry(output) for scanner in scanners}
@@ -319,15 +324,6 @@ def world_offset_m(frames: Sequence[SceneFrame]) -> Float64[np.ndarray, "3"]:
     """Give the scene's origin in the recording's world: whole metres near the mean camera."""
     # adding zero turns -0.0 into 0.0
     return np.round(np.mean([frame.camera_to_world[:3, 3] for frame in frames], axis=0)) + 0.0
-
-
-def _write_cloud(output: Path, frames: Sequence[SceneFrame]) -> None:
-    parts = [output / _cloud_path(frame) for frame in frames if not frame.held_out]
-    if not merge_parts(parts, output / POINTS):
-        raise InputError(
-            f"{output}: no LiDAR point lies in any training picture. Check the calibration from the scanner to "
-            "the cameras, and the masks (255 = use the pixel)."
-        )
 
 
 def _keep_left_out(output: Path, tolerance: Tolerance) -> None:
