@@ -301,14 +301,13 @@ def _witness(folder: Path) -> Iterator[Path]:
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=".cluster-", dir=folder)
+        witness = tempfile.NamedTemporaryFile(prefix=".cluster-", dir=folder)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror}). Choose another folder.") from error
-    os.close(handle)
     try:
-        yield Path(name)
+        with witness:
+            yield Path(witness.name)
     finally:
-        Path(name).unlink(missing_ok=True)
         for path in missing:
             try:
                 path.rmdir()
@@ -386,8 +385,9 @@ def _local(count: int) -> Iterator[Any]:
     import torch
     from distributed import Nanny, Scheduler, Security, SpecCluster
 
-    gpus = _gpus(torch.cuda.device_count())
-    places = [{"env": {"CUDA_VISIBLE_DEVICES": name}, "resources": {GPU: 1}} for name in gpus]
+    visible, gpus = os.environ.get("CUDA_VISIBLE_DEVICES"), torch.cuda.device_count()
+    names = visible.split(",") if visible else map(str, range(gpus))
+    places = [{"env": {"CUDA_VISIBLE_DEVICES": name}, "resources": {GPU: 1}} for name in [*names][:gpus]]
     places = places or [{} for _ in range(os.cpu_count() or 1)]
     security = Security.temporary()
     here = {"host": "127.0.0.1", "protocol": "tls://", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
@@ -411,10 +411,3 @@ def _local(count: int) -> Iterator[Any]:
                 **quiet,
             )
         )
-
-
-def _gpus(count: int) -> list[str]:
-    """What CUDA_VISIBLE_DEVICES calls each GPU."""
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    names = visible.split(",") if visible else [str(number) for number in range(count)]
-    return names[:count]
