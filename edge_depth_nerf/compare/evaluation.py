@@ -221,16 +221,13 @@ class ViewEvaluator:
         dataset = self.pipeline.datamanager.eval_dataset
         by_angle, by_distance = BinnedErrors(ANGLE_EDGES_DEG), BinnedErrors(DISTANCE_EDGES_M)
 
-        def save(view: EvaluatedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
+        def save(view: EvaluatedView, rgb: Tensor, distance_m: Tensor, images: dict[str, Tensor]) -> None:
             for name in ("img", "distance"):
                 _save(images[name], folder / f"eval_{name}_{view.number:04d}.png")
 
-        def look(view: EvaluatedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
-            number, batch = view.number, view.batch
-            save(view, outputs, images)
-            rgb = outputs["rgb"].clamp(0, 1).cpu()
-            distance_m = outputs["depth"][..., 0].cpu() * self.model.metres_per_unit
-            mask = batch["mask"][..., 0].cpu()
+        def look(view: EvaluatedView, rgb: Tensor, distance_m: Tensor, images: dict[str, Tensor]) -> None:
+            save(view, rgb, distance_m, images)
+            number, batch, mask = view.number, view.batch, view.batch["mask"][..., 0].cpu()
             target = batch.get("truth_rgb", batch["image"])[..., :3].cpu()
             true_m = batch.get("truth_distance_m", batch.get("lidar_distance_m"))
             true_m = None if true_m is None else true_m[..., 0].cpu()
@@ -260,8 +257,8 @@ class ViewEvaluator:
             detail_shifted_1m_masked_psnr, and so on. Distances are the same as without.
         """
 
-        def look(view: EvaluatedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
-            _save(outputs["rgb"], folder / f"eval_detail_{view.number:04d}.png")
+        def look(view: EvaluatedView, rgb: Tensor, distance_m: Tensor, images: dict[str, Tensor]) -> None:
+            _save(rgb, folder / f"eval_detail_{view.number:04d}.png")
 
         with detail_shown(True):
             main = main_views(self.pipeline.datamanager.eval_dataset)
@@ -343,7 +340,7 @@ class ViewEvaluator:
                         errors = DepthErrors()
                         errors.update(distance_m, true_m, mask)
                         of_view |= errors.compute(f"{name}_")
-                look(view, outputs, images)
+                look(view, rgb, distance_m, images)
                 found.append(figures)
                 self.on_view()
         return _means(found) | model.evaluation.pooled() | edges.compute()

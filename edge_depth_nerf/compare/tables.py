@@ -119,15 +119,11 @@ def psnr_at(curve: Sequence[dict[str, float]], seconds: float, name: str, clock:
 
 def steps_to(curve: Sequence[dict[str, float]], psnr: float, name: str) -> float:
     """Steps after which a curve first reaches a PSNR; infinity if it never does."""
-    before = None
-    for point in curve:
-        if point[name] >= psnr:
-            if before is None:
-                return point["step"]
-            share = (psnr - before[name]) / (point[name] - before[name])
-            return before["step"] + share * (point["step"] - before["step"])
-        before = point
-    return math.inf
+    reached = next((number for number, point in enumerate(curve) if point[name] >= psnr), None)
+    if reached is None:
+        return math.inf
+    around = curve[max(reached - 1, 0) : reached + 1]
+    return float(np.interp(psnr, [point[name] for point in around], [point["step"] for point in around]))
 
 
 def curve_metric(results: Results) -> str:
