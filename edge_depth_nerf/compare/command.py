@@ -6,7 +6,7 @@ import hashlib
 import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -87,7 +87,7 @@ def _methods(options: TrainingOptions) -> Sequence[MethodName]:
 
 
 def _opened_runs(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, Setting]) -> list[Run]:
-    """Check the scenes, and begin the folders of all runs that are asked for."""
+    """Check the scenes, write down what all runs share, and begin the folders of those that are asked for."""
     methods = _methods(options)
     scenes = {scene.resolve().name: scene.resolve() for scene in options.scenes}
     if len(scenes) < len(options.scenes):
@@ -97,7 +97,12 @@ def _opened_runs(options: CompareOptions | SearchOptions, tuned: Mapping[MethodN
         )
     digests = {name: check_scene(folder, methods, options.preset) for name, folder in scenes.items()}
     of_layers = {name: layers_digest(folder) for name, folder in scenes.items()}
-    open_output(options, tuned)
+    word = "search" if isinstance(options, SearchOptions) else "compare"
+    path, command = options.output / RECORD, command_line(["edge-depth-nerf", word], options)
+    record = _record(options, tuned)
+    wanted = {**record, "commands": [*dict.fromkeys([*record.get("commands", []), command])]}
+    if not path.is_file() or read_json_object(path) != wanted:
+        write_json(path, wanted)
     compared, tried = (options, []) if isinstance(options, CompareOptions) else (None, options.tried)
     runs = [
         Run(
@@ -228,20 +233,6 @@ def _setting(value: Any) -> float | None:
     return found if found is not None and 0 < found < MAX_SETTING else None
 
 
-def open_output(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, Setting]) -> None:
-    """Begin the output folder, or make sure that it was begun with what all its runs share.
-
-    Raises:
-        InputError: it holds another comparison, or something else.
-    """
-    word = "search" if isinstance(options, SearchOptions) else "compare"
-    path, command = options.output / RECORD, command_line(["edge-depth-nerf", word], options)
-    record = _record(options, tuned)
-    wanted = {**record, "commands": [*dict.fromkeys([*record.get("commands", []), command])]}
-    if not path.is_file() or read_json_object(path) != wanted:
-        write_json(path, wanted)
-
-
 def _record(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, Setting]) -> dict[str, Any]:
     """What the output folder's record is to hold of what all its runs share, beside the commands so far.
 
@@ -260,7 +251,12 @@ def _record(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, 
         raise InputError(f"{options.output}: contains other files. Choose a new or empty folder for --output.")
     found = _same(path, record, "this folder contains a comparison with", "") if path.is_file() else record
     for name in _methods(options) if compared else ():
-        _check_setting(options.output, name, tuned.get(name, Setting()))
+        setting = tuned.get(name, Setting())
+        for begun in sorted(options.output.glob(f"{RUNS}/*/{name}_seed-*/{SPECIFICATION}")):
+            run = read_json_object(begun)
+            there = Setting(run.get("weight"), run.get("sigma_m"))
+            if there != setting:
+                raise InputError(f"{begun}: this run was started with {there}, not {setting}. Choose another --output.")
     if compared and compared.tuned and {*tuned} & {*_methods(options)}:
         content = read_json_object(compared.tuned)
         # files of a search of one drive have it as `scene`
@@ -280,19 +276,6 @@ def _same(path: Path, wanted: Mapping[str, Any], words: str, remedy: str) -> dic
         if value != found[name]:
             raise InputError(f"{path}: {words} {name} {found[name]}, not {value}. Choose another --output{remedy}.")
     return found
-
-
-def _check_setting(output: Path, name: MethodName, setting: Setting) -> None:
-    """Make sure that the runs that a method has were begun with a λ and σ.
-
-    Raises:
-        InputError: one has others.
-    """
-    for path in sorted(output.glob(f"{RUNS}/*/{name}_seed-*/{SPECIFICATION}")):
-        run = read_json_object(path)
-        found = Setting(run.get("weight"), run.get("sigma_m"))
-        if found != setting:
-            raise InputError(f"{path}: this run was started with {found}, not {setting}. Choose another --output.")
 
 
 class Run:
@@ -340,14 +323,14 @@ def do_runs(runs: Sequence[Run], options: TrainingOptions, console: Console) -> 
     tasks = [run.task for run in runs]
     if not tasks:
         return
-    with ExitStack() as stack:
-        if options.cluster is None:
-            place = stack.enter_context(this_machine(options.jobs, len(tasks), console))
-        else:
-            from edge_depth_nerf.jobs.cluster import on_cluster  # imports Dask
+    if options.cluster is None:
+        opened = this_machine(options.jobs, len(tasks), console)
+    else:
+        from edge_depth_nerf.jobs.cluster import on_cluster  # imports Dask
 
-            scenes = sorted({Path(run.specification.scene) for run in runs})
-            place = stack.enter_context(on_cluster(options.cluster, tasks, scenes, console))
+        scenes = sorted({Path(run.specification.scene) for run in runs})
+        opened = on_cluster(options.cluster, tasks, scenes, console)
+    with opened as place:
         do_tasks(tasks, place, console)
 
 
