@@ -61,7 +61,7 @@ def grid(options: GridOptions, console: Console | None = None) -> Results:
     for scene in options.scenes:
         check_scene(scene, cells, options.preset)
     shared: dict[str, Any] = {each.name: getattr(options, each.name) for each in fields(TrainingOptions)}
-    tuning = {"scenes": options.tuning, "output": folder, "seeds": options.seeds[:1]}
+    tuning: dict[str, Any] = {"scenes": options.tuning, "output": folder, "seeds": options.seeds[:1]}
     tuning["methods"] = tuple(name for name in cells if METHODS[name].loss != "none")
     asked = SearchOptions(lambdas=options.lambdas, sigmas_m=options.sigmas_m, **shared | tuning)
     searched = search(asked, console)

@@ -182,7 +182,7 @@ def do_run(folder: Path) -> None:
     trainer = MeasuredTrainer(config, folder / PROGRESS, steps)
     trainer.setup()
     dataset: Any = trainer.pipeline.datamanager.eval_dataset
-    beside = shifted_views(Path(run.scene), dataset) if run.whole_views else {}
+    beside = shifted_views(dataset) if run.whole_views else {}
     # a broken file of a sweep is named before the training
     scan_rays = HeldOutRays.of(dataset.scene) if run.whole_views else None
     views = len(dataset) + sum(map(len, beside.values())) if run.whole_views else 0
