@@ -192,29 +192,24 @@ class Cluster:
         from distributed import KilledWorker
 
         try:
-            machine = done.result()
-            _wait_for(task.makes, machine)
+            _wait_for(task.makes, machine=done.result())
+            ended.set_result(None)
+            return
         except InputError as error:
-            ended.set_exception(error)
+            fault = error
         except KilledWorker as error:
             count = error.allowed_failures + 1
             lost = f"{_count(count, 'worker')} {'was' if count == 1 else 'were'}"
-            ended.set_exception(
-                InputError(
-                    f"{task.title}: {lost} lost while running it. Its log is {task.log}. The workers' logs may show "
-                    "the reason; often it is too little memory. Finished work is kept. Run the same command again "
-                    "to resume."
-                )
+            fault = InputError(
+                f"{task.title}: {lost} lost while running it. Its log is {task.log}. The workers' logs may show the "
+                "reason; often it is too little memory. Finished work is kept. Run the same command again to resume."
             )
         except BaseException as error:  # whatever a worker or a lost scheduler makes of it
-            ended.set_exception(
-                InputError(
-                    f"{task.title}: the cluster did not finish it ({type(error).__name__}: {error}). Check whether "
-                    "scheduler and workers still run; finished work is kept. Run the same command again to resume."
-                )
+            fault = InputError(
+                f"{task.title}: the cluster did not finish it ({type(error).__name__}: {error}). Check whether "
+                "scheduler and workers still run; finished work is kept. Run the same command again to resume."
             )
-        else:
-            ended.set_result(None)
+        ended.set_exception(fault)
 
 
 def _wait_for(path: Path, machine: str) -> None:
