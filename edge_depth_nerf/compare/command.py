@@ -36,7 +36,7 @@ from edge_depth_nerf.report.compared_views import compared_views
 from edge_depth_nerf.report.tables import latex_of_tables, page_of_tables, show_tables
 from edge_depth_nerf.report.views import REPORT
 from edge_depth_nerf.scene.format import LAYERS, TRANSFORMS
-from edge_depth_nerf.scene.reader import read_scene
+from edge_depth_nerf.scene.reader import SceneFolder, read_scene
 
 RECORD = "compare.json"
 RUNS = "runs"
@@ -95,8 +95,8 @@ def _opened_runs(options: CompareOptions | SearchOptions, tuned: Mapping[MethodN
             f"scenes {', '.join(map(str, options.scenes))}: two folders have the same name, which the tables use. "
             "Rename one, or give each scene once."
         )
-    digests = {name: check_scene(folder, methods, options.preset) for name, folder in scenes.items()}
-    of_layers = {name: layers_digest(folder) for name, folder in scenes.items()}
+    read = [check_scene(folder, methods, options.preset) for folder in scenes.values()]
+    digests = {scene.folder.name: (sha256_of(scene.path), layers_digest(scene)) for scene in read}
     word = "search" if isinstance(options, SearchOptions) else "compare"
     path, command = options.output / RECORD, command_line(["edge-depth-nerf", word], options)
     record = _record(options, tuned)
@@ -108,7 +108,7 @@ def _opened_runs(options: CompareOptions | SearchOptions, tuned: Mapping[MethodN
         Run(
             RunSpecification(
                 scene=str(scenes[scene]),
-                scene_sha256=digests[scene],
+                scene_sha256=digests[scene][0],
                 preset=options.preset,
                 method=name,
                 seed=seed,
@@ -117,7 +117,7 @@ def _opened_runs(options: CompareOptions | SearchOptions, tuned: Mapping[MethodN
                 sigma_m=setting.sigma_m,
                 whole_views=compared is not None,
                 detail=compared is not None and compared.detail,
-                layers_sha256=of_layers[scene],
+                layers_sha256=digests[scene][1],
             ),
             options.output / RUNS,
         )
@@ -162,24 +162,24 @@ def write_comparison(output: Path, results: Results, console: Console) -> Report
     return make_report(results, tables, plots, console)
 
 
-def layers_digest(folder: Path) -> str:
+def layers_digest(scene: SceneFolder) -> str:
     """SHA-256 of all files that a scene has beside its pictures: masks, maps, and what they are evaluated by.
 
     Other maps may have the names of those before, and then transforms.json does not change.
     """
-    maps = [(layer, path) for each in read_scene(folder).pictures for layer, path in each.files.items()]
+    maps = [(layer, path) for each in scene.pictures for layer, path in each.files.items()]
     digest = hashlib.sha256()
-    for name in sorted({path.relative_to(folder).as_posix() for layer, path in maps if layer != "image"}):
+    for name in sorted({path.relative_to(scene.folder).as_posix() for layer, path in maps if layer != "image"}):
         digest.update(f"{name}\n".encode())
-        digest.update(bytes.fromhex(sha256_of(folder / name)))
+        digest.update(bytes.fromhex(sha256_of(scene.folder / name)))
     return digest.hexdigest()
 
 
 REMEDIES = {"lidar": "process the drive with LiDAR", "mono": "make them by `edge-depth-nerf estimate-depth`"}
 
 
-def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> str:
-    """Make sure that every method can be trained on a scene; give the SHA-256 of its transforms.json.
+def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> SceneFolder:
+    """Make sure that every method can be trained on a scene; give it.
 
     Raises:
         FileNotFoundError: there is no scene.
@@ -201,7 +201,7 @@ def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> str
                 f"{path}: has no {' and no '.join(LAYERS[source].words for source in missing)}, which the method "
                 f"{name} (preset {preset}) needs. {remedies}, or choose other --methods."
             )
-    return sha256_of(path)
+    return scene
 
 
 def read_tuned(path: Path) -> dict[MethodName, Setting]:
