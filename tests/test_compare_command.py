@@ -76,7 +76,7 @@ def test_input_is_checked_before_anything_starts(tmp_path, monkeypatch):
     refused(InputError, r"no monocular maps.*estimate-depth", without, methods=("edge",))
     lacking = write_scene(tmp_path / "e")
     (lacking / "mono/0003.png").unlink()
-    refused(FileNotFoundError, r"mono/0003\.png: no such file, but .*transforms\.json names it", lacking)
+    refused(InputError, r"mono/0003\.png: no such file, but .*transforms\.json names it", lacking)
     all_trained = write_scene(tmp_path / "d", split=False)
     refused(InputError, "found 0 pictures under test_filenames", all_trained)
     tuned = tmp_path / "tuned.json"

@@ -119,7 +119,7 @@ def with_shifted_views(scene):
 
 def test_shifted_views_stand_where_the_scene_says(pipeline):
     dataset = pipeline.datamanager.eval_dataset
-    views = shifted_views(dataset.scene.path.parent, dataset)
+    views = shifted_views(dataset)
     assert [len(views[metres]) for metres in ("0", "1")] == [1, 1]
     same, beside = (views[metres][0]() for metres in ("0", "1"))
     assert torch.allclose(same.camera.camera_to_worlds[0], dataset.cameras[0].camera_to_worlds, atol=1e-6)
@@ -138,7 +138,7 @@ def test_shifted_views_have_the_figures_of_the_whole_picture(pipeline, monkeypat
         model, "forward", lambda ray_bundle: (rendered.append(len(ray_bundle)), original(ray_bundle))[1]
     )
     monkeypatch.setattr(model.config, "eval_num_rays_per_chunk", 100)
-    views, told = shifted_views(dataset.scene.path.parent, dataset), []
+    views, told = shifted_views(dataset), []
     found = ViewEvaluator(pipeline, lambda: told.append(1)).shifted(views)
     assert len(told) == 2 and max(rendered) <= 100
     assert sum(rendered) == 2 * int(dataset.mask(0).sum()) < 2 * dataset.mask(0).size

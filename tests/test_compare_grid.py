@@ -185,7 +185,7 @@ def asked(folder: Path, **changes):
 @pytest.mark.slow
 def test_a_grid_searches_every_cell_alike_and_goes_on_where_it_was(tmp_path, made_up):
     done, stops = made_up
-    options = asked(tmp_path, search_steps=3)
+    options = asked(tmp_path)
     searches, evaluations = len(WITH_LOSS) * len(LAMBDAS) * len(SIGMAS_M) * 2, len(GRID) * 2
     # stopped in the search, and in the comparison
     stops.add(50)
@@ -204,7 +204,7 @@ def test_a_grid_searches_every_cell_alike_and_goes_on_where_it_was(tmp_path, mad
     tries: dict[str, set] = {name: set() for name in WITH_LOSS}
     for run in done:
         spec = run.specification
-        assert spec.steps == (5 if spec.whole_views else 3)
+        assert spec.steps == 5
         if not spec.whole_views:
             tries[spec.method].add((Path(spec.scene).name, spec.weight, spec.sigma_m))
         else:
@@ -244,7 +244,6 @@ def test_a_grid_that_cannot_be(tmp_path, monkeypatch):
 
     refused("--tuning: expected at least one scene", tuning=())
     refused("other drives than those that are evaluated", tuning=(*options.tuning, tmp_path / "street"))
-    refused("--search-steps 0: expected 1 or more", search_steps=0)
     refused("paper has no extras", preset="paper")
     refused("at least 4", lambdas=(1.0, 2.0))
     refused("--methods edge-mono: expected cells", methods=("edge", "edge-mono"))

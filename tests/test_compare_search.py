@@ -51,7 +51,7 @@ def test_a_search_writes_what_compare_takes(tmp_path, monkeypatch):
     ds_nerf, ours = search.grids(found)
     assert ds_nerf.at_the_edge == [] and ours.at_the_edge == ["λ"]
     text = (output / "search.md").read_text()
-    assert "| λ | σ 0.1 m | σ 0.5 m | σ 2 m | σ its own |" in text
+    assert "| | σ 0.1 m | σ 0.5 m | σ 2 m | σ its own |" in text and "| λ 0.01 |" in text
     assert "**30.00**" in text and "best λ is at an end" in text
     read = command.read_tuned(output / "tuned.json")
     assert read == {"ds-nerf": Setting(0.1, 0.5), "edge": Setting(1.0, "own")}

@@ -1,5 +1,6 @@
 """Tables by hand, of made-up runs."""
 
+import math
 import re
 import statistics
 from typing import Any
@@ -208,7 +209,7 @@ def test_psnr_at_a_time_and_steps_to_a_psnr():
     assert {seconds: tables.psnr_at(CURVE, seconds, "psnr", "seconds") for seconds in at} == pytest.approx(at)
     steps = {9.0: 10, 13.0: 15, 16.0: 20, 17.5: 35}
     assert {psnr: tables.steps_to(CURVE, psnr, "psnr") for psnr in steps} == pytest.approx(steps)
-    assert tables.steps_to(CURVE, 18.1, "psnr") is None
+    assert tables.steps_to(CURVE, 18.1, "psnr") == math.inf
 
 
 def test_time_to_the_psnr_of_nerfacto(results):

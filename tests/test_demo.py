@@ -30,6 +30,7 @@ from edge_depth_nerf.process import build
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.lidar_checks import LidarCheck
 from edge_depth_nerf.process.options import Kitti360Options, RigOptions
+from edge_depth_nerf.scene.reader import read_scene
 from edge_depth_nerf.synthetic.drive import synthesize_drive
 from edge_depth_nerf.synthetic.options import SynthesizeOptions
 
@@ -158,7 +159,7 @@ def test_a_recording_of_ones_own(recording, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(comparing, "draw_plots", lambda *_: [])
     # whether LiDAR lies on the pictures takes a minute, and is of test_wrong_recordings.py
     monkeypatch.setattr(build, "check_lidar", lambda *_: LidarCheck((), ()))
-    monkeypatch.setattr(comparing, "check_scene", lambda *_: "")
+    monkeypatch.setattr(comparing, "check_scene", lambda folder, *_: read_scene(folder))
     monkeypatch.setattr(demo, "process", lambda given, console: convert(replace(given, refine_poses=False), console))
     monkeypatch.chdir(tmp_path)
     results = demo.run_demo(DemoOptions(real=recording, frames=5, steps=9), Console(width=200))

@@ -353,7 +353,7 @@ def test_views_are_evaluated_with_detail_beside_those_without(tmp_path, monkeypa
     grey_ball(pipeline, monkeypatch)
     told: list[int] = []
     evaluator = ViewEvaluator(pipeline, lambda: told.append(1))
-    beside = shifted_views(scene, pipeline.datamanager.eval_dataset)
+    beside = shifted_views(pipeline.datamanager.eval_dataset)
     plain, _ = evaluator.held_out(tmp_path / "views")
     plain |= evaluator.shifted(beside)
     found = evaluator.with_detail(tmp_path / "views", beside)

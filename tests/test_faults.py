@@ -106,9 +106,9 @@ def test_arrays_of_an_archive_come_back(tmp_path: Path) -> None:
     ("content", "compression", "said"),
     [
         (npy(np.arange(3.0)), zipfile.ZIP_BZIP2, "a uses an unsupported compression"),
-        (npy(np.array(["words"])), zipfile.ZIP_STORED, "a holds <U5"),
-        (npy(np.arange(126.0)), zipfile.ZIP_STORED, r"a has the shape \(126,\) of float64, more than 1000"),
-        (npy(np.arange(9.0))[:-8], zipfile.ZIP_STORED, "cannot be read as arrays"),
+        (npy(np.array(["words"])), zipfile.ZIP_STORED, "a: an array of <U5"),
+        (npy(np.arange(126.0)), zipfile.ZIP_STORED, r"a: an array of float64 and shape \(126,\); .* at most 1000"),
+        (npy(np.arange(9.0))[:-8], zipfile.ZIP_STORED, "a: an array .* all that the header promises"),
         (b"no array", zipfile.ZIP_STORED, "a.npz: a"),
     ],
 )

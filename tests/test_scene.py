@@ -352,12 +352,12 @@ def test_cloud_is_thinned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def test_one_point_of_each_cube(seed: int, voxel_m: float) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-4, 4, (300, 3)).astype(np.float32)
-    part = points_module._Part(points, rng.integers(0, 256, (300, 3), dtype=np.uint8))
+    part = points, rng.integers(0, 256, (300, 3), dtype=np.uint8)
     cells = {tuple(cell) for cell in np.floor(points / voxel_m).astype(int)}
-    thinned = points_module._thinned([part], voxel_m)
-    assert {tuple(cell) for cell in np.floor(thinned.points_m / voxel_m).astype(int)} == cells
-    assert len(thinned.points_m) == len(cells)
-    assert np.array_equal(points_module._thinned([thinned], voxel_m).points_m, thinned.points_m)
+    thinned, _ = points_module._thinned([part], voxel_m, 300)
+    assert {tuple(cell) for cell in np.floor(thinned[0] / voxel_m).astype(int)} == cells
+    assert len(thinned[0]) == len(cells)
+    assert np.array_equal(points_module._thinned([thinned], voxel_m, 300)[0][0], thinned[0])
 
 
 # ---- interrupted, and run again --------------------------------------------------------------------------------
@@ -480,7 +480,7 @@ SKEWED[0, 0] = 1.01
         ({"given": bad({"cloud": NO_POINTS})}, "no LiDAR point lies in any training picture"),
         ({"given": bad({"lidar": HALF})}, "its LiDAR map: 16×32 pixels, expected 32×32"),
         ({"given": bad({"mono": HALF})}, "its monocular map: 16×32 pixels, expected 32×32"),
-        ({"given": bad({"image": np.zeros((8, 9, 3), np.uint8)})}, "the picture: 9×8 pixels, expected 32×32"),
+        ({"given": bad({"image": np.zeros((8, 9, 3), np.uint8)})}, "its picture: 9×8 pixels, expected 32×32"),
         ({"given": bad({"mask": HALF > 0}), "layers": ("lidar", "mask")}, "its mask: 16×32 pixels"),
         ({"mask": HALF > 0}, "mask of camera image_02: 16×32 pixels, expected 32×32"),
         ({"mask": np.zeros((SIZE, SIZE), bool)}, "mask of camera image_02 leaves no pixel.*inverted"),

@@ -422,15 +422,20 @@ def read_npy(path: Path) -> NDArray:
     """
     size = check_bytes(path, 9 * MAX_PIXELS)
     with path.open("rb") as file:
-        shape, fortran, kind = read_array_header(file, str(path))
-        count, start = math.prod(shape), file.tell()
-        if kind.kind not in "fiu" or count > MAX_PIXELS or count * kind.itemsize > size - start:
-            raise InputError(
-                f"{path}: {size - start} bytes of numbers for an array of {kind} and shape {shape}; expected numbers, "
-                f"all that the header promises, at most {MAX_PIXELS}. Make the file again."
-            )
-        numbers = np.fromfile(file, kind, count)
-    return numbers.reshape(shape, order="F" if fortran else "C")
+        return _read_array(file, str(path), min(size, 8 * MAX_PIXELS))
+
+
+def _read_array(file: Any, where: str, most_bytes: int) -> NDArray:
+    """Read an array of numbers in NumPy's format that takes at most `most_bytes`; errors name `where`."""
+    shape, fortran, kind = read_array_header(file, where)
+    size = math.prod(shape) * kind.itemsize
+    content = bytearray(file.read(size) if size <= most_bytes else b"")
+    if kind.kind not in "fiu" or len(content) != size:
+        raise InputError(
+            f"{where}: an array of {kind} and shape {shape}; expected numbers, all that the header promises, in at "
+            f"most {most_bytes} bytes. Delete or make the file again."
+        )
+    return np.frombuffer(content, kind, math.prod(shape)).reshape(shape, order="F" if fortran else "C")
 
 
 def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDArray]:
@@ -449,16 +454,7 @@ def read_npz(path: Path, names: Iterable[str], most_bytes: int) -> dict[str, NDA
                 if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                     raise ValueError(f"{name} uses an unsupported compression")
                 with archive.open(entry) as member:
-                    shape, fortran, kind = read_array_header(member, f"{path}: {name}")
-                    count = math.prod(shape)
-                    if kind.kind not in "fiu":
-                        raise ValueError(f"{name} holds {kind}")
-                    if count * kind.itemsize > most_bytes:
-                        raise ValueError(f"{name} has the shape {shape} of {kind}, more than {most_bytes} bytes")
-                    content = member.read(count * kind.itemsize)
-                found[name] = np.frombuffer(bytearray(content), kind, count).reshape(
-                    shape, order="F" if fortran else "C"
-                )
+                    found[name] = _read_array(member, f"{path}: {name}", most_bytes)
     except InputError:
         raise
     except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:

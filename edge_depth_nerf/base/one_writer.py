@@ -42,7 +42,7 @@ def only_writer(folder: Path, console: Console) -> Iterator[None]:
         return
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
-        handle = _locked(folder, console)
+        handle, place = _locked(folder, console)
     except OSError:
         # cannot be made or locked: who writes to it tells why, or can
         yield
@@ -57,21 +57,21 @@ def only_writer(folder: Path, console: Console) -> Iterator[None]:
                 path.rmdir()
             except OSError:
                 break  # something is in it
-        _unlock(folder, handle)
+        _unlock(handle, place)
 
 
-def _locked(folder: Path, console: Console) -> int:
-    """Lock a folder; give what is to be closed."""
-    said = False
+def _locked(folder: Path, console: Console) -> tuple[int, Path]:
+    """Lock a folder, or on Windows a file beside it; give what is to be closed, and what is locked."""
+    whole, said = folder.resolve(), False
+    place = folder if fcntl is not None else whole.with_name(f".{whole.name}.lock")
     while True:
         folder.mkdir(parents=True, exist_ok=True)
-        place = _lock_of(folder)
         handle = os.open(place, os.O_RDONLY if fcntl is not None else os.O_RDWR | os.O_CREAT)
         try:
             _try_lock(handle)
             # whoever held it may have taken it away
             if os.path.samestat(os.fstat(handle), os.stat(place)):
-                return handle
+                return handle, place
         except FileNotFoundError:
             pass
         except BlockingIOError:
@@ -83,14 +83,6 @@ def _locked(folder: Path, console: Console) -> int:
             os.close(handle)
             raise
         os.close(handle)
-
-
-def _lock_of(folder: Path) -> Path:
-    """What is locked: the folder, or on Windows a file beside it."""
-    if fcntl is not None:
-        return folder
-    whole = folder.resolve()
-    return whole.with_name(f".{whole.name}.lock")
 
 
 def _try_lock(handle: int) -> None:
@@ -105,13 +97,13 @@ def _try_lock(handle: int) -> None:
         raise BlockingIOError from error
 
 
-def _unlock(folder: Path, handle: int) -> None:
+def _unlock(handle: int, place: Path) -> None:
     """Let go of what `_locked` gave."""
     if msvcrt is not None:
         msvcrt.locking(handle, msvcrt.LK_UNLCK, 1)  # pyrefly: ignore[missing-attribute]
     os.close(handle)
     if fcntl is None:
         try:
-            _lock_of(folder).unlink(missing_ok=True)
+            place.unlink(missing_ok=True)
         except OSError:
             pass  # whoever waits for it has it open, and removes it

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,18 +54,15 @@ _BASALT: dict[str, tuple[Any, tuple[str, ...], dict[str, float]]] = {
     "eucm": (EUCM, (*_PINHOLE, "alpha", "beta"), {}),
     "ucm": (EUCM, (*_PINHOLE, "alpha"), {"beta": 1.0}),
 }
-_FISHEYE = (KannalaBrandt, ("k1", "k2", "k3", "k4"))
-_DOUBLE_SPHERE = (DoubleSphere, ("xi", "alpha"))
 MODELS: dict[str, tuple[Any, tuple[str, ...]]] = {
     "mei": (MEI, ("xi", "k1", "k2", "p1", "p2")),
-    **dict.fromkeys(("kannala-brandt", "opencv_fisheye", "equidistant"), _FISHEYE),
+    **dict.fromkeys(("kannala-brandt", "opencv_fisheye", "equidistant"), (KannalaBrandt, _EQUIDISTANT)),
     "pinhole": (Pinhole, ("k1", "k2", "p1", "p2", "k3")),
-    **dict.fromkeys(("double-sphere", "ds"), _DOUBLE_SPHERE),
+    **dict.fromkeys(("double-sphere", "ds"), (DoubleSphere, ("xi", "alpha"))),
     "eucm": (EUCM, ("alpha", "beta")),
 }
 """Models, and what they have beside focal lengths and principal point; `OF_MODEL` are needed, others 0 if left out."""
 OF_MODEL = ("xi", "alpha", "beta")
-_OCAM_LINES = 5
 _OCAM_COEFFICIENTS = range(1, 8)
 _OF_SCALE = (1e-2, 1e6)
 
@@ -85,10 +81,7 @@ def read_lens(path: Path, name: str = "") -> Camera:
         FileNotFoundError: there is no such file.
         InputError: another kind of file, broken, without that camera, or with a model that is not known.
     """
-    readers: dict[str, Callable[[Path, str], Camera]] = {
-        **{".yaml": _kalibr, ".yml": _kalibr},
-        **{".json": _basalt, ".txt": _ocam, ".toml": _table},
-    }
+    readers = {".yaml": _kalibr, ".yml": _kalibr, ".json": _basalt, ".txt": _ocam, ".toml": _table}
     if path.suffix.lower() not in readers:
         raise InputError(
             f"{path}: expected Kalibr's camchain (.yaml), Basalt's calibration (.json), OCamCalib's calib_results "
@@ -147,23 +140,20 @@ def _basalt(path: Path, name: str) -> Camera:
 
 def _ocam(path: Path, name: str) -> Camera:
     """OCamCalib's calib_results.txt; its first axis is down, its second right, and its third looks backwards."""
-    lines = [
-        line.split() for line in read_text(path, _MAX_BYTES).splitlines() if line.strip() and line.strip()[0] != "#"
-    ]
-    numbers = [[_word(word) for word in line] for line in lines]
-    polynomial = numbers[0] if numbers else []
-    count = int(polynomial[0] or 0) if polynomial else 0
-    fits = len(numbers) == _OCAM_LINES and [len(line) for line in numbers[2:]] == [2, 3, 2]
-    if not fits or count != len(polynomial) - 1 or any(None in numbers[line] for line in (0, 2, 3, 4)):
+    lines = [line.split() for line in read_text(path, _MAX_BYTES).splitlines()]
+    try:
+        numbers = [[float(word) for word in line] for line in lines if line and line[0][0] != "#"]
+        (count, *coefficients), _, (row, column), (c, d, e), (height, width) = numbers
+        if count != len(coefficients) or not all(math.isfinite(one) for line in numbers for one in line):
+            raise ValueError
+    except ValueError:
         raise InputError(
             f"{path}: expected OCamCalib's calib_results.txt: the polynomial and its inverse with their numbers of "
             "coefficients, centre (row, column), affine parameters c, d, e, and size (height, width)."
-        )
-    values = [[value for value in line if value is not None] for line in numbers]
-    coefficients, (row, column), (c, d, e), (height, width) = values[0][1:], values[2], values[3], values[4]
+        ) from None
     if name or count not in _OCAM_COEFFICIENTS or not _OF_SCALE[0] < abs(coefficients[0]) < _OF_SCALE[1] or c <= 0:
         raise InputError(
-            f"{path}: {count} coefficients, the first {coefficients[0] if count else 'missing'}, c = {c}; expected 1 "
+            f"{path}: {count:g} coefficients, the first {coefficients[0] if count else 'missing'}, c = {c}; expected 1 "
             f"to {_OCAM_COEFFICIENTS[-1]}, the first a focal length in pixels, c above 0, and no name: the "
             "file has one camera."
         )
@@ -200,13 +190,6 @@ def _table(path: Path, name: str) -> Camera:
         given[key] -= more["centre"]
     camera = _camera(model, given, [lens.get("width"), lens.get("height")], where)
     return replace(camera, theta_limit_rad=math.radians(min(max(more["limit"], 1.0), 180.0)))
-
-
-def _word(word: str) -> float | None:
-    try:
-        return finite(float(word))
-    except ValueError:
-        return None
 
 
 def _chosen(path: Path, cameras: dict[str, dict[str, Any]], name: str, kind: str) -> tuple[str, dict[str, Any]]:

@@ -98,8 +98,9 @@ class Distortion:
             if index.numel() == 0:
                 break
             here, there, old = plane[index], target[index], residual[index]
-            step = (self._inverse_jacobian(here) * old[..., None, :]).sum(-1)
-            new = here - share[index] * step
+            step, determinant = self._newton_step(here, old)
+            # at the rim the determinant may be zero; a finite inverse there keeps steps finite
+            new = here - share[index] * step / determinant.clamp_min(eps)
             new = new * (radius_max / new.norm(dim=-1, keepdim=True).clamp_min(eps)).clamp_max(1.0)
             new_residual = self.distort(new) - there
             better = (new_residual.norm(dim=-1) < old.norm(dim=-1))[:, None]
@@ -156,16 +157,13 @@ class Distortion:
         """
         plane = distorted
         for _ in range(steps):
-            xx, yy, xy = self._jacobian(plane)
-            determinant = xx * yy - xy * xy
-            u, v = (self.distort(plane) - distorted).unbind(-1)
+            step, determinant = self._newton_step(plane, self.distort(plane) - distorted)
             moves = determinant.abs() > smallest_determinant
-            step = torch.stack((yy * u - xy * v, xx * v - xy * u), -1) / torch.where(moves, determinant, 1.0)[..., None]
-            plane = plane - torch.where(moves[..., None], step, 0.0)
+            plane = plane - torch.where(moves, step / torch.where(moves, determinant, 1.0), 0.0)
         return plane
 
-    def _jacobian(self, plane: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The symmetric Jacobian's xx, yy and xy."""
+    def _newton_step(self, plane: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+        """What a residual divided by the symmetric Jacobian is, times its determinant; and that."""
         x, y = plane.unbind(-1)
         square = x * x + y * y
         slope = torch.zeros_like(square)
@@ -174,14 +172,9 @@ class Distortion:
         diagonal = self._scale(square) + 2.0 * (self.p2 * x + self.p1 * y)
         xx = diagonal + 2.0 * slope * x * x + 4.0 * self.p2 * x
         yy = diagonal + 2.0 * slope * y * y + 4.0 * self.p1 * y
-        return xx, yy, 2.0 * slope * x * y + 2.0 * (self.p1 * x + self.p2 * y)
-
-    def _inverse_jacobian(self, plane: Tensor) -> Tensor:
-        xx, yy, xy = self._jacobian(plane)
-        # at the rim the determinant may be zero; a finite inverse there keeps steps finite
-        determinant = (xx * yy - xy * xy).clamp_min(torch.finfo(plane.dtype).eps)
-        rows = torch.stack((torch.stack((yy, -xy), -1), torch.stack((-xy, xx), -1)), -2)
-        return rows / determinant[..., None, None]
+        xy = 2.0 * slope * x * y + 2.0 * (self.p1 * x + self.p2 * y)
+        u, v = residual.unbind(-1)
+        return torch.stack((yy * u - xy * v, xx * v - xy * u), -1), (xx * yy - xy * xy)[..., None]
 
 
 def first_positive_root(ascending: list[float]) -> float:

@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from edge_depth_nerf.base.bounds import MAX_PIXELS
+from edge_depth_nerf.base.bounds import check_pixels
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras.distortion import Distortion
 
@@ -63,10 +63,7 @@ class Camera(ABC):
                 raise InputError(f"{self.model} camera: {field.name} is {value:g}, expected at most {MAX_PARAMETER:g}.")
             if value <= 0 and field.name in ("width", "height", "fx", "fy"):
                 raise InputError(f"{self.model} camera: {field.name} is {value}, expected more than 0.")
-        if self.width * self.height > MAX_PIXELS:
-            raise InputError(
-                f"{self.model} camera: {self.width}×{self.height} pixels, expected at most {MAX_PIXELS} in all."
-            )
+        check_pixels(self.width, self.height, f"{self.model} camera")
         if not 0 < self.theta_limit_rad <= math.pi:
             raise InputError(
                 f"{self.model} camera: theta_limit_rad is {self.theta_limit_rad}, expected more than 0 and at most pi."
@@ -78,8 +75,10 @@ class Camera(ABC):
         """The largest angle from the z axis up to which the model is one-to-one, at most `theta_limit_rad`."""
 
     @cached_property
-    @abstractmethod
-    def _distortion(self) -> Distortion: ...
+    def _distortion(self) -> Distortion:
+        """By those of k1 to k4, p1 and p2 that the model has."""
+        radial = tuple(getattr(self, name) for name in ("k1", "k2", "k3", "k4") if hasattr(self, name))
+        return Distortion(radial, getattr(self, "p1", 0.0), getattr(self, "p2", 0.0))
 
     @cached_property
     @abstractmethod
@@ -211,10 +210,6 @@ class MEI(Camera):
         return 1.0 / math.sqrt((self.xi - 1.0) * (self.xi + 1.0)) if self.xi > 1 else math.inf
 
     @cached_property
-    def _distortion(self) -> Distortion:
-        return Distortion((self.k1, self.k2), self.p1, self.p2)
-
-    @cached_property
     def _radius_max(self) -> float:
         if self.theta_limit_rad < self._theta_of_model:
             return math.sin(self.theta_limit_rad) / (math.cos(self.theta_limit_rad) + self.xi)
@@ -261,10 +256,6 @@ class KannalaBrandt(Camera):
         """Where the polynomial stops to rise, at most `theta_limit_rad`."""
         return min(self._distortion.radius_max, self.theta_limit_rad)
 
-    @cached_property
-    def _distortion(self) -> Distortion:
-        return Distortion((self.k1, self.k2, self.k3, self.k4), self.p1, self.p2)
-
     @property
     def _radius_max(self) -> float:
         return self.theta_max_rad
@@ -306,10 +297,6 @@ class Pinhole(Camera):
     def theta_max_rad(self) -> float:
         """90°, which no ray reaches; less where the distortion folds before, or where `theta_limit_rad` is less."""
         return math.atan(self._radius_max)
-
-    @cached_property
-    def _distortion(self) -> Distortion:
-        return Distortion((self.k1, self.k2, self.k3, self.k4), self.p1, self.p2)
 
     @property
     def _radius_max(self) -> float:

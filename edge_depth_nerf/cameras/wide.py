@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.cameras.distortion import Distortion, first_positive_root
+from edge_depth_nerf.cameras.distortion import first_positive_root
 from edge_depth_nerf.cameras.models import MEI, Camera
 
 _TABLE_SIZE = 4096
@@ -61,10 +61,6 @@ class _Unified(Camera):
         psi = self._mei.theta_max_rad
         rim = self._back(torch.tensor([math.sin(psi), 0.0, math.cos(psi)], dtype=torch.float64))
         return min(math.atan2(float(rim[0]), float(rim[2])), self.theta_limit_rad)
-
-    @cached_property
-    def _distortion(self) -> Distortion:
-        return Distortion()
 
     @cached_property
     def _radius_max(self) -> float:
@@ -176,10 +172,6 @@ class OCam(Camera):
     def theta_max_rad(self) -> float:
         """The angle of the largest radius, at most `theta_limit_rad`."""
         return min(float(self._table[0][-1]), self.theta_limit_rad)
-
-    @cached_property
-    def _distortion(self) -> Distortion:
-        return Distortion()
 
     @cached_property
     def _radius_max(self) -> float:

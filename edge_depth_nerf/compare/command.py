@@ -6,7 +6,7 @@ import hashlib
 import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -35,7 +35,8 @@ from edge_depth_nerf.report.build import Report, write_report
 from edge_depth_nerf.report.compared_views import compared_views
 from edge_depth_nerf.report.tables import latex_of_tables, page_of_tables, show_tables
 from edge_depth_nerf.report.views import REPORT
-from edge_depth_nerf.scene.format import DEPTH_KEY, LAYERS, layers_of, read_transforms
+from edge_depth_nerf.scene.format import LAYERS, TRANSFORMS
+from edge_depth_nerf.scene.reader import SceneFolder, read_scene
 
 RECORD = "compare.json"
 RUNS = "runs"
@@ -86,7 +87,7 @@ def _methods(options: TrainingOptions) -> Sequence[MethodName]:
 
 
 def _opened_runs(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, Setting]) -> list[Run]:
-    """Check the scenes, and begin the folders of all runs that are asked for."""
+    """Check the scenes, write down what all runs share, and begin the folders of those that are asked for."""
     methods = _methods(options)
     scenes = {scene.resolve().name: scene.resolve() for scene in options.scenes}
     if len(scenes) < len(options.scenes):
@@ -94,15 +95,20 @@ def _opened_runs(options: CompareOptions | SearchOptions, tuned: Mapping[MethodN
             f"scenes {', '.join(map(str, options.scenes))}: two folders have the same name, which the tables use. "
             "Rename one, or give each scene once."
         )
-    digests = {name: check_scene(folder, methods, options.preset) for name, folder in scenes.items()}
-    of_layers = {name: layers_digest(folder) for name, folder in scenes.items()}
-    open_output(options, tuned)
+    read = [check_scene(folder, methods, options.preset) for folder in scenes.values()]
+    digests = {scene.folder.name: (sha256_of(scene.path), layers_digest(scene)) for scene in read}
+    word = "search" if isinstance(options, SearchOptions) else "compare"
+    path, command = options.output / RECORD, command_line(["edge-depth-nerf", word], options)
+    record = _record(options, tuned)
+    wanted = {**record, "commands": [*dict.fromkeys([*record.get("commands", []), command])]}
+    if not path.is_file() or read_json_object(path) != wanted:
+        write_json(path, wanted)
     compared, tried = (options, []) if isinstance(options, CompareOptions) else (None, options.tried)
     runs = [
         Run(
             RunSpecification(
                 scene=str(scenes[scene]),
-                scene_sha256=digests[scene],
+                scene_sha256=digests[scene][0],
                 preset=options.preset,
                 method=name,
                 seed=seed,
@@ -111,7 +117,7 @@ def _opened_runs(options: CompareOptions | SearchOptions, tuned: Mapping[MethodN
                 sigma_m=setting.sigma_m,
                 whole_views=compared is not None,
                 detail=compared is not None and compared.detail,
-                layers_sha256=of_layers[scene],
+                layers_sha256=digests[scene][1],
             ),
             options.output / RUNS,
         )
@@ -156,59 +162,46 @@ def write_comparison(output: Path, results: Results, console: Console) -> Report
     return make_report(results, tables, plots, console)
 
 
-def layers_digest(folder: Path) -> str:
+def layers_digest(scene: SceneFolder) -> str:
     """SHA-256 of all files that a scene has beside its pictures: masks, maps, and what they are evaluated by.
 
     Other maps may have the names of those before, and then transforms.json does not change.
-
-    Raises:
-        FileNotFoundError: one of them is missing.
     """
-    keys = [*(layer.key for name, layer in LAYERS.items() if name != "image"), DEPTH_KEY]
-    transforms = folder / "transforms.json"
-    frames = read_transforms(transforms)["frames"]
+    maps = [(layer, path) for each in scene.pictures for layer, path in each.files.items()]
     digest = hashlib.sha256()
-    for name in sorted({frame[key] for frame in frames for key in keys if isinstance(frame.get(key), str)}):
-        path = folder / name
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file, but {transforms} names it. Process the drive again.")
+    for name in sorted({path.relative_to(scene.folder).as_posix() for layer, path in maps if layer != "image"}):
         digest.update(f"{name}\n".encode())
-        digest.update(bytes.fromhex(sha256_of(path)))
+        digest.update(bytes.fromhex(sha256_of(scene.folder / name)))
     return digest.hexdigest()
 
 
 REMEDIES = {"lidar": "process the drive with LiDAR", "mono": "make them by `edge-depth-nerf estimate-depth`"}
 
 
-def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> str:
-    """Make sure that every method can be trained on a scene; give the SHA-256 of its transforms.json.
+def check_scene(folder: Path, methods: Sequence[MethodName], preset: str) -> SceneFolder:
+    """Make sure that every method can be trained on a scene; give it.
 
     Raises:
         FileNotFoundError: there is no scene.
-        InputError: it has no split, or lacks the maps that a method needs.
+        InputError: it is broken, has no split, or lacks the maps that a method needs.
     """
-    path = folder / "transforms.json"
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"{path}: no such file. compare takes scene folders; `edge-depth-nerf process` makes one from a raw drive."
-        )
-    meta = read_transforms(path)
-    frames, held_out = meta["frames"], meta.get("test_filenames") or []
-    if not held_out or set(held_out) & set(meta.get("train_filenames", [])):
+    path = folder / TRANSFORMS
+    scene = read_scene(path)
+    held_out = scene.meta.get("test_filenames") or []
+    if not held_out or set(held_out) & set(scene.meta.get("train_filenames", [])):
         raise InputError(
             f"{path}: found {len(held_out)} pictures under test_filenames that are not training pictures; expected "
             "at least one for evaluation. Process the drive with --holdout-every 2 or more."
         )
-    has = layers_of(frames[0])
     for name in methods:
-        missing = [source for source in METHODS[name].needs if source not in has]
+        missing = [source for source in METHODS[name].needs if not scene.has(source)]
         if missing:
             remedies = " and ".join(REMEDIES[source] for source in missing).capitalize()
             raise InputError(
                 f"{path}: has no {' and no '.join(LAYERS[source].words for source in missing)}, which the method "
                 f"{name} (preset {preset}) needs. {remedies}, or choose other --methods."
             )
-    return sha256_of(path)
+    return scene
 
 
 def read_tuned(path: Path) -> dict[MethodName, Setting]:
@@ -240,20 +233,6 @@ def _setting(value: Any) -> float | None:
     return found if found is not None and 0 < found < MAX_SETTING else None
 
 
-def open_output(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, Setting]) -> None:
-    """Begin the output folder, or make sure that it was begun with what all its runs share.
-
-    Raises:
-        InputError: it holds another comparison, or something else.
-    """
-    word = "search" if isinstance(options, SearchOptions) else "compare"
-    path, command = options.output / RECORD, command_line(["edge-depth-nerf", word], options)
-    record = _record(options, tuned)
-    wanted = {**record, "commands": [*dict.fromkeys([*record.get("commands", []), command])]}
-    if not path.is_file() or read_json_object(path) != wanted:
-        write_json(path, wanted)
-
-
 def _record(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, Setting]) -> dict[str, Any]:
     """What the output folder's record is to hold of what all its runs share, beside the commands so far.
 
@@ -272,7 +251,12 @@ def _record(options: CompareOptions | SearchOptions, tuned: Mapping[MethodName, 
         raise InputError(f"{options.output}: contains other files. Choose a new or empty folder for --output.")
     found = _same(path, record, "this folder contains a comparison with", "") if path.is_file() else record
     for name in _methods(options) if compared else ():
-        _check_setting(options.output, name, tuned.get(name, Setting()))
+        setting = tuned.get(name, Setting())
+        for begun in sorted(options.output.glob(f"{RUNS}/*/{name}_seed-*/{SPECIFICATION}")):
+            run = read_json_object(begun)
+            there = Setting(run.get("weight"), run.get("sigma_m"))
+            if there != setting:
+                raise InputError(f"{begun}: this run was started with {there}, not {setting}. Choose another --output.")
     if compared and compared.tuned and {*tuned} & {*_methods(options)}:
         content = read_json_object(compared.tuned)
         # files of a search of one drive have it as `scene`
@@ -292,19 +276,6 @@ def _same(path: Path, wanted: Mapping[str, Any], words: str, remedy: str) -> dic
         if value != found[name]:
             raise InputError(f"{path}: {words} {name} {found[name]}, not {value}. Choose another --output{remedy}.")
     return found
-
-
-def _check_setting(output: Path, name: MethodName, setting: Setting) -> None:
-    """Make sure that the runs that a method has were begun with a λ and σ.
-
-    Raises:
-        InputError: one has others.
-    """
-    for path in sorted(output.glob(f"{RUNS}/*/{name}_seed-*/{SPECIFICATION}")):
-        run = read_json_object(path)
-        found = Setting(run.get("weight"), run.get("sigma_m"))
-        if found != setting:
-            raise InputError(f"{path}: this run was started with {found}, not {setting}. Choose another --output.")
 
 
 class Run:
@@ -352,14 +323,14 @@ def do_runs(runs: Sequence[Run], options: TrainingOptions, console: Console) -> 
     tasks = [run.task for run in runs]
     if not tasks:
         return
-    with ExitStack() as stack:
-        if options.cluster is None:
-            place = stack.enter_context(this_machine(options.jobs, len(tasks), console))
-        else:
-            from edge_depth_nerf.jobs.cluster import on_cluster  # imports Dask
+    if options.cluster is None:
+        opened = this_machine(options.jobs, len(tasks), console)
+    else:
+        from edge_depth_nerf.jobs.cluster import on_cluster  # imports Dask
 
-            scenes = sorted({Path(run.specification.scene) for run in runs})
-            place = stack.enter_context(on_cluster(options.cluster, tasks, scenes, console))
+        scenes = sorted({Path(run.specification.scene) for run in runs})
+        opened = on_cluster(options.cluster, tasks, scenes, console)
+    with opened as place:
         do_tasks(tasks, place, console)
 
 

@@ -34,7 +34,6 @@ from edge_depth_nerf.plugin.detail import detail_shown
 from edge_depth_nerf.plugin.evaluation import evaluated
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 from edge_depth_nerf.report.compared_views import BY_VIEW
-from edge_depth_nerf.scene.format import read_transforms
 
 PIXELS_PER_VIEW = 3000
 MOST_PIXELS = 20_000
@@ -158,20 +157,16 @@ def evaluate_pixels(pipeline: Any, chosen: list[ChosenPixels], trained_on: bool 
     return figures
 
 
-def shifted_views(scene: Path, dataset: FisheyeDepthDataset) -> dict[str, list[Callable[[], EvaluatedView]]]:
+def shifted_views(dataset: FisheyeDepthDataset) -> dict[str, list[Callable[[], EvaluatedView]]]:
     """The views from beside the path whose truth a rendered drive brings; none in recorded ones.
 
     Returns:
         By the metres that they lie sideways, what loads each. They have lens and mask of the first held-out picture
         of their camera.
     """
-    meta = read_transforms(scene / "transforms.json")
-    outputs = dataset._dataparser_outputs
+    scene, outputs = dataset.scene, dataset._dataparser_outputs
     to_scene = outputs.dataparser_transform.double()
-    cameras = {scene / frame["file_path"]: frame.get("camera") for frame in meta["frames"]}
-    of_camera: dict[str | None, int] = {}
-    for number, image in enumerate(dataset.image_filenames):
-        of_camera.setdefault(cameras[image], number)
+    of_camera = {picture.camera: number for number, picture in reversed([*enumerate(dataset.pictures)])}
 
     def load(entry: dict[str, Any]) -> EvaluatedView:
         number = of_camera[entry["camera"]]
@@ -179,8 +174,8 @@ def shifted_views(scene: Path, dataset: FisheyeDepthDataset) -> dict[str, list[C
         pose[:, 3] *= outputs.dataparser_scale
         camera = dataset.cameras[number : number + 1]
         camera.camera_to_worlds = pose[None].to(camera.camera_to_worlds)
-        rgb = read_image(scene / entry["truth_rgb_file_path"]).astype(np.float32) / 255
-        distance_m = read_distance_png(scene / entry["truth_distance_file_path"])
+        rgb = read_image(scene.folder / entry["truth_rgb_file_path"]).astype(np.float32) / 255
+        distance_m = read_distance_png(scene.folder / entry["truth_distance_file_path"])
         return EvaluatedView(
             number,
             camera,
@@ -193,7 +188,7 @@ def shifted_views(scene: Path, dataset: FisheyeDepthDataset) -> dict[str, list[C
 
     return {
         metres: [partial(load, entry) for entry in entries if entry["camera"] in of_camera]
-        for metres, entries in meta.get("shifted_views", {}).items()
+        for metres, entries in scene.meta.get("shifted_views", {}).items()
     }
 
 
@@ -221,16 +216,13 @@ class ViewEvaluator:
         dataset = self.pipeline.datamanager.eval_dataset
         by_angle, by_distance = BinnedErrors(ANGLE_EDGES_DEG), BinnedErrors(DISTANCE_EDGES_M)
 
-        def save(view: EvaluatedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
+        def save(view: EvaluatedView, rgb: Tensor, distance_m: Tensor, images: dict[str, Tensor]) -> None:
             for name in ("img", "distance"):
                 _save(images[name], folder / f"eval_{name}_{view.number:04d}.png")
 
-        def look(view: EvaluatedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
-            number, batch = view.number, view.batch
-            save(view, outputs, images)
-            rgb = outputs["rgb"].clamp(0, 1).cpu()
-            distance_m = outputs["depth"][..., 0].cpu() * self.model.metres_per_unit
-            mask = batch["mask"][..., 0].cpu()
+        def look(view: EvaluatedView, rgb: Tensor, distance_m: Tensor, images: dict[str, Tensor]) -> None:
+            save(view, rgb, distance_m, images)
+            number, batch, mask = view.number, view.batch, view.batch["mask"][..., 0].cpu()
             target = batch.get("truth_rgb", batch["image"])[..., :3].cpu()
             true_m = batch.get("truth_distance_m", batch.get("lidar_distance_m"))
             true_m = None if true_m is None else true_m[..., 0].cpu()
@@ -260,8 +252,8 @@ class ViewEvaluator:
             detail_shifted_1m_masked_psnr, and so on. Distances are the same as without.
         """
 
-        def look(view: EvaluatedView, outputs: dict[str, Tensor], images: dict[str, Tensor]) -> None:
-            _save(outputs["rgb"], folder / f"eval_detail_{view.number:04d}.png")
+        def look(view: EvaluatedView, rgb: Tensor, distance_m: Tensor, images: dict[str, Tensor]) -> None:
+            _save(rgb, folder / f"eval_detail_{view.number:04d}.png")
 
         with detail_shown(True):
             main = main_views(self.pipeline.datamanager.eval_dataset)
@@ -343,7 +335,7 @@ class ViewEvaluator:
                         errors = DepthErrors()
                         errors.update(distance_m, true_m, mask)
                         of_view |= errors.compute(f"{name}_")
-                look(view, outputs, images)
+                look(view, rgb, distance_m, images)
                 found.append(figures)
                 self.on_view()
         return _means(found) | model.evaluation.pooled() | edges.compute()

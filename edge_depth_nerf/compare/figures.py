@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from edge_depth_nerf.method.metrics import EVALUATED_RANGE_M, LEAST_SQUARED_ERROR
+from edge_depth_nerf.method.metrics import LEAST_SQUARED_ERROR, DepthErrors
 
 ANGLE_EDGES_DEG = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0, 120.0)
 """Bins of the angle from the optical axis."""
@@ -43,12 +44,9 @@ class BinnedErrors:
     """Errors of colour and distance in bins of some quantity, pooled over the pixels of all pictures given."""
 
     def __init__(self, edges: Sequence[float]) -> None:
-        self.edges = torch.tensor(edges, dtype=torch.float64)
-        self._sums: dict[str, Tensor] = {}
-
-    def _add(self, name: str, where: Tensor, values: Tensor | None = None) -> None:
-        found = torch.bincount(where, None if values is None else values.double(), minlength=len(self.edges) - 1)
-        self._sums[name] = self._sums.get(name, 0) + found.double()
+        self._bins = [*pairwise(edges)]
+        self._distances = [DepthErrors() for _ in self._bins]
+        self._pixels, self._squared = [0] * len(self._bins), [0.0] * len(self._bins)
 
     def update(
         self,
@@ -69,29 +67,20 @@ class BinnedErrors:
             pred_m: rendered distance, metres.
             true_m: true distance, metres; counted from 1 to 60 m, the range of all distance errors.
         """
-        values = values.double()
-        counted = mask & (values >= self.edges[0]) & (values < self.edges[-1])
-        where = torch.bucketize(values[counted], self.edges, right=True) - 1
-        self._add("pixels", where)
-        self._add("squared", where, (pred[counted].double() - target[counted].double()).square().mean(dim=-1))
-        if true_m is None:
-            return
-        true = true_m[counted].double()
-        known = (true >= EVALUATED_RANGE_M[0]) & (true <= EVALUATED_RANGE_M[1])
-        pred_there, true, where = pred_m[counted].double()[known], true[known], where[known]
-        self._add("with distance", where)
-        self._add("abs_rel", where, (pred_there - true).abs() / true)
-        self._add("delta_1_25", where, (pred_there < 1.25 * true) & (true < 1.25 * pred_there))
+        squared, values = (pred.double() - target.double()).square().mean(dim=-1), values.double()
+        for number, (low, high) in enumerate(self._bins):
+            counted = mask & (values >= low) & (values < high)
+            self._pixels[number] += int(counted.sum())
+            self._squared[number] += float(squared[counted].sum())
+            if true_m is not None:
+                self._distances[number].update(pred_m, true_m, counted)
 
     def compute(self) -> list[dict[str, float]]:
-        """The bins that have pixels: low, high, pixels, psnr (dB); where distances are known abs_rel, delta_1_25."""
+        """The bins that have pixels: low, high, pixels, psnr (dB); where distances are known the errors of these."""
         found = []
-        for index in self._sums.get("pixels", torch.zeros(0)).nonzero()[:, 0].tolist():
-            sums = {name: float(values[index]) for name, values in self._sums.items()}
-            mean = max(sums["squared"] / sums["pixels"], LEAST_SQUARED_ERROR)
-            figures = {"low": float(self.edges[index]), "high": float(self.edges[index + 1])}
-            figures |= {"pixels": sums["pixels"], "psnr": -10 * math.log10(mean)}
-            if known := sums.get("with distance", 0):
-                figures |= {name: sums[name] / known for name in ("abs_rel", "delta_1_25")}
-            found.append(figures)
+        for number, (low, high) in enumerate(self._bins):
+            if pixels := self._pixels[number]:
+                psnr = -10 * math.log10(max(self._squared[number] / pixels, LEAST_SQUARED_ERROR))
+                errors = self._distances[number].compute("")
+                found.append({**errors, "low": low, "high": high, "pixels": float(pixels), "psnr": psnr})
         return found

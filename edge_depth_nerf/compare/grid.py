@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields
 from itertools import product
-from operator import sub, truediv
 from typing import Any
 
 from rich.console import Console
@@ -28,20 +28,11 @@ from edge_depth_nerf.compare.methods import (
     MethodName,
     PriorName,
 )
-from edge_depth_nerf.compare.options import CompareOptions, GridOptions, SearchOptions
+from edge_depth_nerf.compare.options import CompareOptions, GridOptions, SearchOptions, TrainingOptions
 from edge_depth_nerf.compare.results import Results
 from edge_depth_nerf.compare.search import TUNED, Grid, grids, search, seeds_in_words
-from edge_depth_nerf.compare.tables import introduction, means_over, per_seed, psnr_metric
-from edge_depth_nerf.report.tables import (
-    Cell,
-    MadeTable,
-    Metric,
-    Row,
-    mark_best,
-    mean_and_spread,
-    page_of_tables,
-    show_tables,
-)
+from edge_depth_nerf.compare.tables import cell_of, compared, introduction, means_over, psnr_metric
+from edge_depth_nerf.report.tables import Cell, MadeTable, Metric, Row, mark_best, page_of_tables, show_tables
 
 SEARCH, COMPARISON = "search", "comparison"
 GRID_PAGE = "grid.md"
@@ -69,20 +60,13 @@ def grid(options: GridOptions, console: Console | None = None) -> Results:
     # what is to be evaluated is looked at before a search of hours
     for scene in options.scenes:
         check_scene(scene, cells, options.preset)
-    shared: dict[str, Any] = {name: getattr(options, name) for name in ("preset", "jobs", "cluster")}
-    asked = SearchOptions(
-        scenes=options.tuning,
-        output=folder,
-        methods=tuple(name for name in cells if METHODS[name].loss != "none"),
-        steps=options.search_steps or options.steps,
-        seeds=options.seeds[:1],
-        lambdas=options.lambdas,
-        sigmas_m=options.sigmas_m,
-        **shared,
-    )
+    shared: dict[str, Any] = {each.name: getattr(options, each.name) for each in fields(TrainingOptions)}
+    tuning: dict[str, Any] = {"scenes": options.tuning, "output": folder, "seeds": options.seeds[:1]}
+    tuning["methods"] = tuple(name for name in cells if METHODS[name].loss != "none")
+    asked = SearchOptions(lambdas=options.lambdas, sigmas_m=options.sigmas_m, **shared | tuning)
     searched = search(asked, console)
-    shared |= {name: getattr(options, name) for name in ("scenes", "steps", "seeds")}
-    results = compare(CompareOptions(output=comparison, methods=cells, tuned=folder / TUNED, **shared), console)
+    shared |= {"output": comparison, "methods": cells}
+    results = compare(CompareOptions(tuned=folder / TUNED, **shared), console)
     tables = grid_tables(results, grids(searched))
     write_text(options.output / GRID_PAGE, page_of_tables("Grid", grid_lines(results, searched), tables))
     show_tables(tables, console)
@@ -105,24 +89,15 @@ class _Cells:
         """The method of a cell; without a loss and extras there is one for both priors."""
         return self.names.get(Method(loss, None if loss == "none" and not extras else prior, extras))
 
-    def by_seed(self, scenes: Sequence[str], name: MethodName, metric: Metric) -> dict[int, float]:
-        """Means over drives."""
-        return per_seed(self.results, scenes, name, lambda run: run.figures.get(metric.name))
-
     def mean_psnr(self, name: MethodName) -> float:
         """Mean over drives and seeds, dB; minus infinity without a whole row."""
-        found = self.by_seed(self.results.scenes(), name, self.psnr)
-        return statistics.fmean(found.values()) if found else float("-inf")
+        found = cell_of(self.results, self.results.scenes(), name, self.psnr).mean
+        return float("-inf") if found is None else found
 
     def row(self, title: str, one: MethodName, other: MethodName) -> Row:
         """By how much one is ahead of another, over the seeds that both have."""
-        figures = []
-        for _, scenes in self.columns:
-            for metric, compare_two, form in ((self.psnr, sub, "+.2f"), (self.abs_rel, truediv, ".2f")):
-                ours, theirs = (self.by_seed(scenes, name, metric) for name in (one, other))
-                found = [compare_two(ours[seed], theirs[seed]) for seed in ours if seed in theirs]
-                figures.append(Cell(*mean_and_spread(found), form=form))
-        return Row(title, figures)
+        pairs = product([scenes for _, scenes in self.columns], (self.psnr, self.abs_rel))
+        return Row(title, [compared(self.results, scenes, one, other, metric) for scenes, metric in pairs])
 
     def table(self, label: str, title: str, rows: list[Row]) -> MadeTable:
         """A table of such rows."""
@@ -209,10 +184,7 @@ def _cells_table(cells: _Cells, searches: Sequence[Grid]) -> MadeTable:
     metrics = [(scenes, metric) for _, scenes in cells.columns for metric in (cells.psnr, cells.abs_rel)]
     rows = []
     for cell, name in cells.names.items():
-        figures = [
-            Cell(*mean_and_spread(list(cells.by_seed(scenes, name, metric).values())), form=metric.form)
-            for scenes, metric in metrics
-        ]
+        figures = [cell_of(cells.results, scenes, name, metric) for scenes, metric in metrics]
         words = ["–", "–", "–"]
         if name in search_of:
             found = search_of[name]

@@ -141,16 +141,11 @@ class GridOptions(SearchOptions):
 
     tuning: tuple[Path, ...]
     """Scene folders to search λ and σ on, of other drives than the evaluated ones."""
-    search_steps: int | None = None
-    """Training steps of each run of the search. Not set: as many as --steps."""
 
     def check(self) -> None:
         """Check what can be checked without looking at the disk; raises InputError."""
         super().check()
         _require(self.preset != "paper", "--preset paper", "lite or full: paper has no extras")
-        _require(
-            self.search_steps is None or self.search_steps >= 1, f"--search-steps {self.search_steps}", "1 or more"
-        )
         _require(len(self.tuning) > 0, "--tuning", "at least one scene that is not evaluated")
         both = {scene.resolve() for scene in self.tuning} & {scene.resolve() for scene in self.scenes}
         _require(not both, f"--tuning {_words(tuple(both))}", "other drives than those that are evaluated")

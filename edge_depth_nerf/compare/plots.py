@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -198,21 +199,19 @@ def draw_plots(output: Path, results: Results) -> list[Plot]:
         For the page: each plot of each drive.
     """
     clock, scenes = clock_metric(results), results.scenes()
-    kinds: dict[str, Callable[[Sequence[str], str], Plot]] = {
-        "psnr_by_steps": lambda of, more: _curves(results, of, f"Training curves by steps{more}", "step", "steps"),
-        "psnr_by_seconds": lambda of, more: _curves(
-            results, of, f"Training curves by time{more}", clock, f"{CLOCKS[clock].lower()} of training"
-        ),
-        "error_by_angle": lambda of, more: _binned(
-            results, of, f"Errors by the angle from the optical axis{more}", "by_angle_deg"
-        ),
-        "error_by_distance": lambda of, more: _binned(results, of, f"Errors by distance{more}", "by_distance_m"),
-    }
+    by_time = partial(_curves, key=clock, label=f"{CLOCKS[clock].lower()} of training")
+    kinds: list[tuple[str, str, Callable[[Results, Sequence[str], str], Plot]]] = [
+        ("psnr_by_steps", "Training curves by steps", partial(_curves, key="step", label="steps")),
+        ("psnr_by_seconds", "Training curves by time", by_time),
+        ("error_by_angle", "Errors by the angle from the optical axis", partial(_binned, key="by_angle_deg")),
+        ("error_by_distance", "Errors by distance", partial(_binned, key="by_distance_m")),
+    ]
     if any(SCANS in run.content for run in results.runs):
-        kinds["error_of_scans"] = lambda of, more: _of_scans(results, of, f"Errors of held-out scans{more}")
+        kinds.append(("error_of_scans", "Errors of held-out scans", _of_scans))
     for_the_page = []
-    for name, plot in kinds.items():
-        of_all = plot(scenes, "")
+    for name, title, plot in kinds:
+        of_all = plot(results, scenes, title)
         write_bytes(output / f"{name}.svg", of_all.light)
-        for_the_page += [plot([scene], f": {scene}") for scene in scenes] if len(scenes) > 1 else [of_all]
+        alone = [plot(results, [scene], f"{title}: {scene}") for scene in scenes] if len(scenes) > 1 else [of_all]
+        for_the_page += alone
     return for_the_page

@@ -90,6 +90,10 @@ class Results:
         """All seeds."""
         return sorted({run.seed for run in self.runs})
 
+    def figure_names(self) -> set[str]:
+        """Names of all figures that any run has."""
+        return {name for run in self.runs for name in run.figures}
+
     def has(self, method: MethodName, seed: int) -> bool:
         """Whether any drive has a run of a method with a seed."""
         return any((scene, method, seed) in self._by_key for scene in self.scenes())

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.files import write_json, write_text
@@ -22,6 +21,7 @@ from edge_depth_nerf.compare.methods import METHODS, MethodName
 from edge_depth_nerf.compare.options import SearchOptions
 from edge_depth_nerf.compare.results import Results, write_rows
 from edge_depth_nerf.compare.tables import curve_metric
+from edge_depth_nerf.report.tables import Cell, MadeTable, Row, page_of_tables, show_tables
 
 TUNED = "tuned.json"
 Pair = tuple[float, float | str]
@@ -53,25 +53,19 @@ class Grid:
         return found + (["σ"] if sigma in (numbers[:1] + numbers[-1:]) else [])
 
     @property
-    def advice(self) -> str:
-        """What to do if the best is at an end; empty if it is not."""
+    def table(self) -> MadeTable:
+        """A row for each λ and a column for each σ, with what to do if the best is at an end."""
+        rows = [
+            Row(
+                f"λ {weight:g}",
+                [Cell(self.psnr.get((weight, sigma)), best=(weight, sigma) == self.best) for sigma in self.sigmas],
+            )
+            for weight in self.lambdas
+        ]
+        headings = ["σ its own" if sigma == "own" else f"σ {sigma:g} m" for sigma in self.sigmas]
         best = " and ".join(self.at_the_edge)
-        return f"The best {best} is at an end of the range. Add values with the same command." if best else ""
-
-    @property
-    def headings(self) -> list[str]:
-        """Those of its table: a column for each σ."""
-        return ["λ", *("σ its own" if sigma == "own" else f"σ {sigma:g} m" for sigma in self.sigmas)]
-
-    def rows(self, mark: str) -> list[list[str]]:
-        """Those of its table, one for each λ; the best has a mark on both sides."""
-        found = []
-        for weight in self.lambdas:
-            values = [self.psnr.get((weight, sigma)) for sigma in self.sigmas]
-            marks = [mark if (weight, sigma) == self.best else "" for sigma in self.sigmas]
-            cells = ["–" if value is None else f"{value:.2f}" for value in values]
-            found.append([f"{weight:g}", *(f"{mark}{cell}{mark}" for mark, cell in zip(marks, cells, strict=True))])
-        return found
+        notes = [f"The best {best} is at an end of the range. Add values with the same command."] if best else []
+        return MadeTable("", METHODS[self.method].title, [("", headings)], rows, notes)
 
 
 def search(options: SearchOptions, console: Console | None = None) -> Results:
@@ -83,11 +77,7 @@ def search(options: SearchOptions, console: Console | None = None) -> Results:
     console = console or Console()
     with finished_runs(options, console) as results:
         write_search(options.output, results)
-        for grid in grids(results):
-            table = Table(*grid.headings, title=METHODS[grid.method].title, caption=grid.advice or None)
-            for row in grid.rows("*"):
-                table.add_row(*row)
-            console.print(table)
+        show_tables([grid.table for grid in grids(results)], console)
         tuned = options.output / TUNED
         say(console, f"The best of each: {tuned}; `edge-depth-nerf compare … --tuned {tuned}` uses it.")
     return results
@@ -152,14 +142,10 @@ def write_search(output: Path, results: Results) -> None:
     write_json(output / TUNED, content)
     against = ", against the ground truth" if "truth" in content["chosen_by"] else ""
     against += ", mean over the drives" if len(results.scenes()) > 1 else ""
-    parts = [
-        "# Search of λ and σ",
+    line = (
         f"{', '.join(results.scenes())}, {seeds_in_words(found)}, preset {content['preset']}, {content['steps']} steps "
-        f"each; PSNR in dB of random held-out pixels inside the mask{against}.",
-    ]
-    for grid in found:
-        lines = [f"| {' | '.join(row)} |" for row in (grid.headings, *grid.rows("**"))]
-        lines.insert(1, "|---" * len(grid.headings) + "|")
-        parts += [f"## {METHODS[grid.method].title}", "\n".join(lines), *([grid.advice] if grid.advice else [])]
-    write_text(output / "search.md", "\n\n".join(parts) + "\n")
+        f"each; PSNR in dB of random held-out pixels inside the mask{against}."
+    )
+    page = page_of_tables("Search of λ and σ", [line], [grid.table for grid in found])
+    write_text(output / "search.md", page)
     write_rows(output, results)

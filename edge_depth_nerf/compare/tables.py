@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from operator import sub, truediv
 from pathlib import Path
 from typing import Any
 
@@ -50,62 +51,33 @@ def means_over(scenes: Sequence[str]) -> list[tuple[str, list[str]]]:
     return [*((scene, [scene]) for scene in scenes), *([("average", [*scenes])] if len(scenes) > 1 else [])]
 
 
-def per_seed(
-    results: Results, scenes: Sequence[str], method: MethodName, value: Callable[[RunResult], float | None]
-) -> dict[int, float]:
-    """Mean over drives of a run's value, for each seed that all drives have it for."""
+def _per_seed(results: Results, scenes: Sequence[str], method: MethodName, metric: Metric) -> dict[int, float]:
+    """Mean over drives of a figure, for each seed that all drives have it for."""
     found = {}
     for seed in results.seeds():
         runs = [results.run(scene, method, seed) for scene in scenes]
-        values = [None if run is None else value(run) for run in runs]
+        values = [None if run is None else run.figures.get(metric.name) for run in runs]
         if all(entry is not None for entry in values):
             found[seed] = statistics.fmean(entry for entry in values if entry is not None)
     return found
 
 
-@dataclass(frozen=True)
-class _Column:
-    """A column of a table with a row for each method."""
-
-    heading: str
-    form: str
-    value: Callable[[RunResult], float | None]
-    best: int = 1
-    """As in `Metric`."""
+def cell_of(results: Results, scenes: Sequence[str], method: MethodName, metric: Metric) -> Cell:
+    """A method's figure, as a mean over drives and seeds."""
+    found = list(_per_seed(results, scenes, method, metric).values())
+    return Cell(None, words="never") if math.inf in found else Cell(*mean_and_spread(found), form=metric.form)
 
 
-def _column(metric: Metric) -> _Column:
-    return _Column(metric.heading, metric.form, lambda run: run.figures.get(metric.name), metric.best)
-
-
-def _cell(results: Results, scenes: Sequence[str], method: MethodName, column: _Column) -> Cell:
-    found = list(per_seed(results, scenes, method, column.value).values())
-    if math.inf in found:
-        return Cell(None, words="never")
-    return Cell(*mean_and_spread(found), form=column.form)
-
-
-def ahead(results: Results, scenes: Sequence[str], method: MethodName, metric: str) -> Cell:
-    """By how much `edge` is ahead of a method, over the seeds that both have."""
-    ours, theirs = (per_seed(results, scenes, name, lambda run: run.figures.get(metric)) for name in ("edge", method))
-    return Cell(*mean_and_spread([ours[seed] - theirs[seed] for seed in ours if seed in theirs]), form="+.2f")
+def compared(results: Results, scenes: Sequence[str], one: MethodName, other: MethodName, metric: Metric) -> Cell:
+    """By how much one is ahead, or where less is better its share of the other's, over the seeds that both have."""
+    ours, theirs = (_per_seed(results, scenes, name, metric) for name in (one, other))
+    compare, form = (sub, "+.2f") if metric.best > 0 else (truediv, ".2f")
+    return Cell(*mean_and_spread([compare(ours[seed], theirs[seed]) for seed in ours if seed in theirs]), form=form)
 
 
 def psnr_metric(results: Results) -> Metric:
     """PSNR against ground truth where all drives have it, else against the pictures."""
     return TRUE_PSNR if all(TRUE_PSNR.name in run.figures for run in results.runs) else PSNR
-
-
-def quality_metrics(results: Results) -> list[Metric]:
-    """PSNR, SSIM, FLIP and, where the weights were there, LPIPS, all inside the mask."""
-    truth = "truth_" if psnr_metric(results) is TRUE_PSNR else ""
-    metrics = [
-        psnr_metric(results),
-        Metric(f"{truth}masked_ssim", "SSIM ↑", ".3f"),
-        Metric(f"{truth}masked_flip", "FLIP ↓", ".3f", -1),
-        Metric(f"{truth}masked_lpips", "LPIPS ↓", ".3f", -1),
-    ]
-    return [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
 
 
 def _quality_table(
@@ -115,14 +87,22 @@ def _quality_table(
     methods: Sequence[MethodName],
     published: Mapping[MethodName, float],
 ) -> MadeTable:
-    metrics = quality_metrics(results)
+    """PSNR, SSIM, FLIP and, where the weights were there, LPIPS, all inside the mask."""
+    truth = "truth_" if psnr_metric(results) is TRUE_PSNR else ""
+    metrics = [
+        psnr_metric(results),
+        Metric(f"{truth}masked_ssim", "SSIM ↑", ".3f"),
+        Metric(f"{truth}masked_flip", "FLIP ↓", ".3f", -1),
+        Metric(f"{truth}masked_lpips", "LPIPS ↓", ".3f", -1),
+    ]
+    metrics = [metric for metric in metrics if metric.name in results.figure_names()]
     columns = means_over(scenes)
     groups = [(name, [metric.heading for metric in metrics]) for name, _ in columns]
     rows = []
     for method in methods:
-        cells = [_cell(results, chosen, method, _column(metric)) for _, chosen in columns for metric in metrics]
+        cells = [cell_of(results, chosen, method, metric) for _, chosen in columns for metric in metrics]
         if "edge" in methods:
-            cells.append(Cell(None) if method == "edge" else ahead(results, scenes, method, metrics[0].name))
+            cells.append(Cell(None) if method == "edge" else compared(results, scenes, "edge", method, metrics[0]))
             cells += [Cell(published.get(method), form="+.2f")] if published else []
         rows.append(Row(METHODS[method].title, cells))
     if "edge" in methods:
@@ -137,17 +117,13 @@ def psnr_at(curve: Sequence[dict[str, float]], seconds: float, name: str, clock:
     return float(np.interp(seconds, [point[clock] for point in curve], [point[name] for point in curve]))
 
 
-def steps_to(curve: Sequence[dict[str, float]], psnr: float, name: str) -> float | None:
-    """Steps after which a curve first reaches a PSNR; None if it never does."""
-    before = None
-    for point in curve:
-        if point[name] >= psnr:
-            if before is None:
-                return point["step"]
-            share = (psnr - before[name]) / (point[name] - before[name])
-            return before["step"] + share * (point["step"] - before["step"])
-        before = point
-    return None
+def steps_to(curve: Sequence[dict[str, float]], psnr: float, name: str) -> float:
+    """Steps after which a curve first reaches a PSNR; infinity if it never does."""
+    reached = next((number for number, point in enumerate(curve) if point[name] >= psnr), None)
+    if reached is None:
+        return math.inf
+    around = curve[max(reached - 1, 0) : reached + 1]
+    return float(np.interp(psnr, [point[name] for point in around], [point["step"] for point in around]))
 
 
 def curve_metric(results: Results) -> str:
@@ -164,13 +140,20 @@ def clock_metric(results: Results) -> str:
     return "cpu_seconds" if on_cpu else "seconds"
 
 
-def _table(results: Results, title: str, scenes: Sequence[str], columns: Sequence[_Column], note: str) -> MadeTable:
+def _table(
+    results: Results, title: str, scenes: Sequence[str], groups: Mapping[str, Sequence[Metric]], note: str
+) -> MadeTable:
+    """A row for each method, and groups of columns, as far as any run has their figures."""
+    names = results.figure_names()
+    there = {group: [metric for metric in metrics if metric.name in names] for group, metrics in groups.items()}
+    every = [metric for metrics in there.values() for metric in metrics]
     rows = [
-        Row(METHODS[method].title, [_cell(results, scenes, method, column) for column in columns])
+        Row(METHODS[method].title, [cell_of(results, scenes, method, metric) for metric in every])
         for method in results.methods()
     ]
-    mark_best(rows, [column.best for column in columns])
-    return MadeTable("", title, [("", [column.heading for column in columns])], rows, [note])
+    mark_best(rows, [metric.best for metric in every])
+    headings = [(group, [metric.heading for metric in metrics]) for group, metrics in there.items() if metrics]
+    return MadeTable("", title, headings, rows, [note])
 
 
 def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
@@ -189,7 +172,6 @@ def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> Made
         Metric("shifted_2m_masked_psnr", "2 m beside ↑", ".2f"),
         Metric("detail_shifted_1m_masked_psnr", "1 m beside, with detail ↑", ".2f"),
     ]
-    metrics = [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
     notes = {
         "fitted": "Fitted: PSNR after an affine fit of each view's colours.",
         PSNR.heading: "Masked PSNR: against the recorded picture.",
@@ -199,43 +181,36 @@ def _geometry_table(results: Results, where: str, scenes: Sequence[str]) -> Made
         "detail": "With detail: PSNR with what training pictures show beyond their own renderings.",
         "beside": "Beside: PSNR of views moved sideways.",
     }
-    headings = " ".join(metric.heading for metric in metrics)
+    headings = " ".join(metric.heading for metric in metrics if metric.name in results.figure_names())
     note = " ".join(text for word, text in notes.items() if word in headings)
-    return _table(results, f"Pictures and geometry, {where}", scenes, list(map(_column, metrics)), note)
+    return _table(results, f"Pictures and geometry, {where}", scenes, {"": metrics}, note)
 
 
 def _edges_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
     """Edges beside PSNR: on the path, beside it, and of cameras that are held out."""
     truth = "truth_" if psnr_metric(results) is TRUE_PSNR else ""
     depth_edges = f"{'truth' if truth else 'lidar'}_depth_edge_recall"
-    figures = {name for run in results.runs for name in run.figures}
-    shifts = sorted(
-        {name.split("_")[1] for name in figures if name.startswith("shifted_")}, key=lambda m: float(m[:-1])
-    )
-    groups = []
+    shifts = {name.split("_")[1] for name in results.figure_names() if name.startswith("shifted_")}
+    groups = {}
     for title, form, on_path, beside in (
         (psnr_metric(results).heading, ".2f", f"{truth}masked_psnr", "masked_psnr"),
         ("edges ↑", ".3f", f"{truth}edge_recall", "edge_recall"),
         ("depth edges ↑", ".3f", depth_edges, "truth_depth_edge_recall"),
     ):
-        further = [Metric(f"shifted_{shift}_{beside}", f"{shift[:-1]} m", form) for shift in shifts]
-        groups.append((title, [Metric(on_path, "0 m", form), *further]))
-    of_cameras = [
+        further = (Metric(f"shifted_{shift}_{beside}", f"{shift[:-1]} m", form) for shift in shifts)
+        groups[title] = [Metric(on_path, "0 m", form), *sorted(further, key=lambda metric: float(metric.heading[:-2]))]
+    groups["held-out cameras"] = [
         Metric(f"camera_{truth}affine_masked_psnr", "PSNR, fitted ↑", ".2f"),
         Metric(f"camera_{truth}edge_recall", "edges ↑", ".3f"),
         Metric(f"camera_{depth_edges}", "depth edges ↑", ".3f"),
     ]
-    groups.append(("held-out cameras", of_cameras))
-    groups = [(title, [metric for metric in metrics if metric.name in figures]) for title, metrics in groups]
-    columns = [_column(metric) for _, metrics in groups for metric in metrics]
     note = (
         "Metres to the left of the path. Edges: the share of the picture's edges that the view has within two pixels, "
         f"in the same direction. Depth edges: the same of {'the ground truth' if truth else 'the held-out LiDAR'}."
     )
-    if groups[-1][1]:
-        note += " Held-out cameras: training saw no picture of them; PSNR is after the colour fit."
-    made = _table(results, f"Edges, and views beside the path, {where}", scenes, columns, note)
-    made.groups = [(title, [metric.heading for metric in metrics]) for title, metrics in groups if metrics]
+    made = _table(results, f"Edges, and views beside the path, {where}", scenes, groups, note)
+    if made.groups[-1][0] == "held-out cameras":
+        made.notes += ["Held-out cameras: training saw no picture of them; PSNR is after the colour fit."]
     return made
 
 
@@ -251,42 +226,39 @@ def _scans_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTab
         Metric("scan_foliage_abs_rel", "foliage: AbsRel ↓", ".3f", -1),
         Metric("scan_foliage_far_25", "foliage: 25 % too far ↓", ".1%", -1),
     ]
-    metrics = [metric for metric in metrics if any(metric.name in run.figures for run in results.runs)]
     note = (
         "Errors of the rendered median distance along the scanner's own rays, 1-60 m, that end inside a held-out "
         "picture. Foliage: rays whose neighbours' lengths scatter by 2 % or more; fences and outlines, too."
     )
-    return _table(results, f"Held-out scans, {where}", scenes, list(map(_column, metrics)), note)
+    return _table(results, f"Held-out scans, {where}", scenes, {"": metrics}, note)
 
 
 def _time_table(results: Results, where: str, scenes: Sequence[str]) -> MadeTable:
     """Seconds, and the PSNR that they bring."""
     name, clock = curve_metric(results), clock_metric(results)
 
-    def at_our_seconds(run: RunResult) -> float | None:
-        ours = results.run(run.scene, "edge", run.seed)
-        return None if ours is None else psnr_at(run.curve, ours.curve[-1][clock], name, clock)
+    def timed(run: RunResult) -> RunResult:
+        last = run.curve[-1]
+        figures = {"of a step": last[clock] / run.content["steps"], "of all": last[clock], "final": last[name]}
+        if ours := results.run(run.scene, "edge", run.seed):
+            figures["at ours"] = psnr_at(run.curve, ours.curve[-1][clock], name, clock)
+        if base := results.run(run.scene, "nerfacto", run.seed):
+            # one run that never gets there leaves no mean
+            figures["to nerfacto"] = steps_to(run.curve, base.curve[-1][name], name)
+        return replace(run, content={"figures": figures})
 
-    def to_nerfacto(run: RunResult) -> float | None:
-        base = results.run(run.scene, "nerfacto", run.seed)
-        if base is None:
-            return None
-        steps = steps_to(run.curve, base.curve[-1][name], name)
-        # one run that never gets there leaves no mean
-        return math.inf if steps is None else steps
-
-    columns = [
-        _Column("s per step", ".3f", lambda run: run.curve[-1][clock] / run.content["steps"], 0),
-        _Column("seconds", ".0f", lambda run: run.curve[-1][clock], 0),
-        _Column("PSNR at our seconds ↑", ".2f", at_our_seconds),
-        _Column("final PSNR ↑", ".2f", lambda run: run.curve[-1][name]),
-        _Column("steps to nerfacto's final PSNR ↓", ".0f", to_nerfacto, -1),
+    metrics = [
+        Metric("of a step", "s per step", ".3f", 0),
+        Metric("of all", "seconds", ".0f", 0),
+        Metric("at ours", "PSNR at our seconds ↑", ".2f"),
+        Metric("final", "final PSNR ↑", ".2f"),
+        Metric("to nerfacto", "steps to nerfacto's final PSNR ↓", ".0f", -1),
     ]
     note = (
         f"{CLOCKS[clock]} of training, without evaluation, saving and making priors. PSNR is of random held-out "
         "pixels. A method that ends before ours keeps its last PSNR."
     )
-    return _table(results, f"Time, {where}", scenes, columns, note)
+    return _table(Results([*map(timed, results.runs)]), f"Time, {where}", scenes, {"": metrics}, note)
 
 
 def listed(found: Any) -> list[str]:
@@ -314,25 +286,17 @@ def _settings_table(results: Results) -> MadeTable:
     return MadeTable("", "λ and σ", [("", ["λ", "σ", "from"])], rows, notes)
 
 
-def differing_fields(configurations: Sequence[Mapping[str, str]]) -> list[str]:
-    """The dotted names in which configurations, as `described` gives them, are not all the same, sorted.
-
-    What is a run's own, its seed, scene and folder, is left out.
-    """
-    names = sorted({name for each in configurations for name in each} - {*OF_A_RUN})
-    return [name for name in names if len({each.get(name) for each in configurations}) > 1]
-
-
 def fields_table(results: Results) -> MadeTable:
     """Each field of the trained configurations in which a method differs from another, and what each method has there.
 
-    It is made from what was trained, not from what the methods name.
+    It is made from what was trained, not from what the methods name. A run's own seed, scene and folder are left out.
     """
     runs = [next(run for run in results.runs if run.method == name) for name in results.methods()]
     configurations = [run.content["configuration"] for run in runs]
     rows = [
         Row(name, [Cell(None, words=str(each.get(name, "–")).strip("'")) for each in configurations])
-        for name in differing_fields(configurations)
+        for name in sorted({name for each in configurations for name in each} - {*OF_A_RUN})
+        if len({each.get(name) for each in configurations}) > 1
     ]
     headings = [METHODS[run.method].title for run in runs]
     note = "From the trained configurations. All other fields are equal."
@@ -369,7 +333,7 @@ def make_tables(results: Results) -> list[MadeTable]:
             tables.append(made)
     # the average stands for its drives, which the page folds away
     *drives, first = means_over(everywhere)
-    figures = {name for run in results.runs for name in run.figures}
+    figures = results.figure_names()
     wide = [_edges_table] * any(name.endswith("edge_recall") for name in figures)
     wide += [_scans_table] * ("scan_median_m" in figures)
     for where, scenes in (first, *drives):
@@ -383,18 +347,15 @@ def make_tables(results: Results) -> list[MadeTable]:
 
 def verdict(results: Results) -> str:
     """Say in a sentence what ours has over nerfacto, as means over drives and seeds; empty without both of them."""
-
-    def mean(method: MethodName, metric: str) -> float | None:
-        return mean_and_spread(list(per_seed(results, scenes, method, lambda run: run.figures.get(metric)).values()))[0]
-
-    scenes, psnr = results.scenes(), psnr_metric(results).name
-    ahead_db = ahead(results, scenes, "nerfacto", psnr).mean
+    scenes = results.scenes()
+    ahead_db = compared(results, scenes, "edge", "nerfacto", psnr_metric(results)).mean
     if ahead_db is None:
         return ""
     word = "better" if ahead_db >= 0 else "worse"
     text = f"Ours renders held-out pictures {abs(ahead_db):.1f} dB {word} than nerfacto (PSNR, a measure of quality)"
     for reference in ("truth", "lidar"):
-        ours, theirs = (mean(method, f"{reference}_abs_rel") for method in ("edge", "nerfacto"))
+        error = Metric(f"{reference}_abs_rel", "AbsRel", ".3f")
+        ours, theirs = (cell_of(results, scenes, method, error).mean for method in ("edge", "nerfacto"))
         if ours is not None and theirs is not None:
             return f"{text}; its distances are wrong by {ours:.1%} on average, nerfacto's by {theirs:.1%}."
     return f"{text}."
@@ -417,9 +378,9 @@ def introduction(results: Results) -> list[str]:
         "seeds. Bold: the best of a column.",
         "Versions: " + ", ".join(f"{name} {number}" for name, number in results.versions.items()) + ".",
     ]
-    if any(name.endswith("masked_flip") for run in results.runs for name in run.figures):
+    if any(name.endswith("masked_flip") for name in results.figure_names()):
         lines.append("FLIP: the difference that a viewer sees, 0 (none) to 1.")
-    if not any(name.endswith("lpips") for run in results.runs for name in run.figures):
+    if not any(name.endswith("lpips") for name in results.figure_names()):
         lines.append("LPIPS is missing: its weights were not on this machine.")
     maps = []
     for trained_on, title in MAPS.items():

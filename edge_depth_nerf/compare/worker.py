@@ -157,24 +157,15 @@ class MeasuredTrainer(EdgeDepthTrainer):
         self.on_step(steps)
 
 
-def read_specification(path: Path) -> RunSpecification:
-    """Read what is to be trained, as the command wrote it.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        InputError: it is not of this form.
-    """
+def do_run(folder: Path) -> None:
+    """Train and evaluate what a folder's run.json describes and is not done yet; figures.json is written last."""
+    path = folder / SPECIFICATION
     try:
-        return RunSpecification(**read_json_object(path))
+        run = RunSpecification(**read_json_object(path))
     except TypeError as error:
         raise InputError(
             f"{path}: is not a run of this version ({error}). Remove its folder; the same command then trains it again."
         ) from None
-
-
-def do_run(folder: Path) -> None:
-    """Train and evaluate what a folder's run.json describes and is not done yet; figures.json is written last."""
-    run = read_specification(folder / SPECIFICATION)
     config, named = configuration(run, folder)
     resolved = described(config)
     steps = config.max_num_iterations
@@ -191,7 +182,7 @@ def do_run(folder: Path) -> None:
     trainer = MeasuredTrainer(config, folder / PROGRESS, steps)
     trainer.setup()
     dataset: Any = trainer.pipeline.datamanager.eval_dataset
-    beside = shifted_views(Path(run.scene), dataset) if run.whole_views else {}
+    beside = shifted_views(dataset) if run.whole_views else {}
     # a broken file of a sweep is named before the training
     scan_rays = HeldOutRays.of(dataset.scene) if run.whole_views else None
     views = len(dataset) + sum(map(len, beside.values())) if run.whole_views else 0

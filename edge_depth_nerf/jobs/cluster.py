@@ -192,29 +192,24 @@ class Cluster:
         from distributed import KilledWorker
 
         try:
-            machine = done.result()
-            _wait_for(task.makes, machine)
+            _wait_for(task.makes, machine=done.result())
+            ended.set_result(None)
+            return
         except InputError as error:
-            ended.set_exception(error)
+            fault = error
         except KilledWorker as error:
             count = error.allowed_failures + 1
             lost = f"{_count(count, 'worker')} {'was' if count == 1 else 'were'}"
-            ended.set_exception(
-                InputError(
-                    f"{task.title}: {lost} lost while running it. Its log is {task.log}. The workers' logs may show "
-                    "the reason; often it is too little memory. Finished work is kept. Run the same command again "
-                    "to resume."
-                )
+            fault = InputError(
+                f"{task.title}: {lost} lost while running it. Its log is {task.log}. The workers' logs may show the "
+                "reason; often it is too little memory. Finished work is kept. Run the same command again to resume."
             )
         except BaseException as error:  # whatever a worker or a lost scheduler makes of it
-            ended.set_exception(
-                InputError(
-                    f"{task.title}: the cluster did not finish it ({type(error).__name__}: {error}). Check whether "
-                    "scheduler and workers still run; finished work is kept. Run the same command again to resume."
-                )
+            fault = InputError(
+                f"{task.title}: the cluster did not finish it ({type(error).__name__}: {error}). Check whether "
+                "scheduler and workers still run; finished work is kept. Run the same command again to resume."
             )
-        else:
-            ended.set_result(None)
+        ended.set_exception(fault)
 
 
 def _wait_for(path: Path, machine: str) -> None:
@@ -301,14 +296,13 @@ def _witness(folder: Path) -> Iterator[Path]:
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=".cluster-", dir=folder)
+        witness = tempfile.NamedTemporaryFile(prefix=".cluster-", dir=folder)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written ({error.strerror}). Choose another folder.") from error
-    os.close(handle)
     try:
-        yield Path(name)
+        with witness:
+            yield Path(witness.name)
     finally:
-        Path(name).unlink(missing_ok=True)
         for path in missing:
             try:
                 path.rmdir()
@@ -386,8 +380,9 @@ def _local(count: int) -> Iterator[Any]:
     import torch
     from distributed import Nanny, Scheduler, Security, SpecCluster
 
-    gpus = _gpus(torch.cuda.device_count())
-    places = [{"env": {"CUDA_VISIBLE_DEVICES": name}, "resources": {GPU: 1}} for name in gpus]
+    visible, gpus = os.environ.get("CUDA_VISIBLE_DEVICES"), torch.cuda.device_count()
+    names = visible.split(",") if visible else map(str, range(gpus))
+    places = [{"env": {"CUDA_VISIBLE_DEVICES": name}, "resources": {GPU: 1}} for name in [*names][:gpus]]
     places = places or [{} for _ in range(os.cpu_count() or 1)]
     security = Security.temporary()
     here = {"host": "127.0.0.1", "protocol": "tls://", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
@@ -411,10 +406,3 @@ def _local(count: int) -> Iterator[Any]:
                 **quiet,
             )
         )
-
-
-def _gpus(count: int) -> list[str]:
-    """What CUDA_VISIBLE_DEVICES calls each GPU."""
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    names = visible.split(",") if visible else [str(number) for number in range(count)]
-    return names[:count]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Lock
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from rich.console import Console
 from rich.progress import Progress, TaskID
@@ -45,29 +45,17 @@ class Task:
     """Whether it wants a GPU for itself, where there are any."""
 
 
-Options = TypeVar("Options")
-
-
 def own_command(words: Sequence[str], options: Any) -> tuple[str, ...]:
-    """Arguments of Python for one of our commands."""
-    return (
-        "-m",
-        "edge_depth_nerf",
-        "--end-with-parent",
-        *shlex.split(command_line(words, with_absolute_paths(options))),
-    )
+    """Arguments of Python for one of our commands, with absolute paths: a worker has a working directory of its own."""
 
+    def absolute(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(map(absolute, value))
+        return value.absolute() if isinstance(value, Path) else value
 
-def with_absolute_paths(options: Options) -> Options:
-    """The same options wherever they are read: a worker has a working directory of its own."""
-    changes: dict[str, Any] = {}
-    for entry in dataclasses.fields(options):  # pyrefly: ignore[bad-argument-type]
-        value = getattr(options, entry.name)
-        if isinstance(value, Path):
-            changes[entry.name] = value.absolute()
-        elif isinstance(value, tuple) and any(isinstance(each, Path) for each in value):
-            changes[entry.name] = tuple(each.absolute() for each in value)
-    return dataclasses.replace(options, **changes)  # pyrefly: ignore[bad-specialization]
+    given = {entry.name: absolute(getattr(options, entry.name)) for entry in dataclasses.fields(options)}
+    line = command_line(words, dataclasses.replace(options, **given))
+    return "-m", "edge_depth_nerf", "--end-with-parent", *shlex.split(line)
 
 
 def shares_told(tell: Callable[[float], None]) -> Callable[[str], None]:
@@ -154,24 +142,19 @@ class _Bars:
         self._ended: set[Task] = set()
         self._lock = Lock()
 
-    def tell(self, task: Task, share: float) -> None:
+    def tell(self, task: Task, share: float, ends: bool = False) -> None:
         with self._lock:
             # what a cluster tells may come late
-            if task not in self._ended:
-                self._show(task, share)
-
-    def end(self, task: Task) -> None:
-        with self._lock:
-            self._show(task, 1.0)
-            self._ended.add(task)
-            self._progress.remove_task(self._bars[task])
-
-    def _show(self, task: Task, share: float) -> None:
-        if task not in self._bars:
-            self._bars[task] = self._progress.add_task(task.title, total=1.0)
-        self._progress.update(self._bars[task], completed=share)
-        self._progress.advance(self._overall, share - self._done.get(task, 0.0))
-        self._done[task] = share
+            if task in self._ended:
+                return
+            if task not in self._bars:
+                self._bars[task] = self._progress.add_task(task.title, total=1.0)
+            self._progress.update(self._bars[task], completed=share)
+            self._done[task] = share
+            self._progress.update(self._overall, completed=sum(self._done.values()))
+            if ends:
+                self._ended.add(task)
+                self._progress.remove_task(self._bars[task])
 
 
 def do_tasks(tasks: Sequence[Task], place: Place, console: Console) -> None:
@@ -186,7 +169,7 @@ def do_tasks(tasks: Sequence[Task], place: Place, console: Console) -> None:
             futures = {place.start(task, partial(bars.tell, task)): task for task in tasks}
             for future in as_completed(futures):
                 future.result()
-                bars.end(futures[future])
+                bars.tell(futures[future], 1.0, ends=True)
         except BaseException:
             place.stop()
             raise

@@ -94,9 +94,7 @@ def require_folder(folder: Path, remedy: str) -> None:
     """
     if folder.is_dir():
         return
-    parent = folder.parent
-    while not parent.is_dir():
-        parent = parent.parent
+    parent = next(each for each in folder.parents if each.is_dir())
     there = sorted(entry.name for entry in parent.iterdir())
     listed = f"{', '.join(there[:12])}{' …' if len(there) > 12 else ''}" if there else "nothing"
     what = "is not a folder" if folder.exists() else "no such folder"

@@ -105,18 +105,13 @@ DISTORTION_PARAMS = "distortion_params"
 """Another key of nerfstudio's: these six in a list."""
 _MAX_FRAMES = 1_000_000
 """Also an upper bound of frame numbers."""
-_NUMBERS = (*INTRINSICS, *DISTORTION, "timestamp_s")
-_SCENE_NUMBERS = ("theta_max_deg", "depth_unit_scale_factor", "applied_scale", "fisheye_crop_radius")
+_NUMBERS = (
+    *INTRINSICS,
+    *DISTORTION,
+    *("timestamp_s", "theta_max_deg", "depth_unit_scale_factor", "applied_scale", "fisheye_crop_radius"),
+)
 _MAY_BE_NULL = ("timestamp_s", "fisheye_crop_radius")
 _ORIENTATIONS = ("pca", "up", "vertical", "none")
-
-
-def is_own_scene(meta: Mapping[str, Any]) -> bool:
-    """Whether a scene was written by `process`: its lengths are metres, its maps distances along the ray.
-
-    Monocular maps say nothing about that: `estimate-depth` puts them into other people's scenes, too.
-    """
-    return "world_offset_m" in meta or LAYERS["lidar"].key in meta["frames"][0]
 
 
 def read_transforms(path: Path) -> dict[str, Any]:
@@ -189,8 +184,6 @@ def _check_frame(frame: Mapping[str, Any], where: str, folder: Path) -> None:
         if key in frame:
             path_inside(folder, frame[key], f"{where}: {key}")
     _check_numbers(frame, where)
-    _check_size(frame, where)
-    _check_distortion(frame, where)
     if "transform_matrix" in frame:
         pose_of(frame, where)
     number = frame.get("frame", 0)
@@ -202,9 +195,13 @@ def _check_frame(frame: Mapping[str, Any], where: str, folder: Path) -> None:
 
 
 def _check_numbers(entry: Mapping[str, Any], where: str) -> None:
-    for key in (*_NUMBERS, *_SCENE_NUMBERS):
+    for key in _NUMBERS:
         if key in entry and not (entry[key] is None and key in _MAY_BE_NULL):
             number_of(entry[key], f"{where}: {key}")
+    _check_size(entry, where)
+    given = entry.get(DISTORTION_PARAMS, [0.0] * 6)
+    if not isinstance(given, list) or len(given) != 6 or any(finite(value) is None for value in given):
+        raise InputError(f"{where}: {DISTORTION_PARAMS} is {shown(given)}, expected 6 numbers. Repair the file.")
 
 
 def _check_size(entry: Mapping[str, Any], where: str) -> None:
@@ -215,16 +212,8 @@ def _check_size(entry: Mapping[str, Any], where: str) -> None:
         check_pixels(int(sides[0]), int(sides[1]), where)
 
 
-def _check_distortion(entry: Mapping[str, Any], where: str) -> None:
-    given = entry.get(DISTORTION_PARAMS, [0.0] * 6)
-    if not isinstance(given, list) or len(given) != 6 or any(finite(value) is None for value in given):
-        raise InputError(f"{where}: {DISTORTION_PARAMS} is {shown(given)}, expected 6 numbers. Repair the file.")
-
-
 def _check_scene(meta: Mapping[str, Any], path: Path) -> None:
     _check_numbers(meta, str(path))
-    _check_size(meta, str(path))
-    _check_distortion(meta, str(path))
     # a width of the whole scene with a height of each frame
     for number, frame in enumerate(meta["frames"]):
         _check_size({**{key: meta[key] for key in ("w", "h") if key in meta}, **frame}, f"{path}: frame {number}")

@@ -43,19 +43,19 @@ class PointCloud:
     """Row and column of each point in its frame's picture."""
 
 
-@dataclass(frozen=True)
-class _Part:
-    points_m: Float32[np.ndarray, "points 3"]
-    """In the scene's world."""
-    colours: UInt8[np.ndarray, "points 3"]
+_Part = tuple[Float32[np.ndarray, "points 3"], UInt8[np.ndarray, "points 3"]]
+"""Points in the scene's world, metres, and their colours."""
 
 
-def _thinned(parts: Sequence[_Part], voxel_m: float) -> _Part:
-    """Keep the first point of each cube, in the order given."""
-    points_m = np.concatenate([part.points_m for part in parts])
-    colours = np.concatenate([part.colours for part in parts])
-    first = first_in_voxel(points_m, voxel_m)
-    return _Part(points_m[first], colours[first])
+def _thinned(parts: Sequence[_Part], voxel_m: float, most: int) -> tuple[_Part, float]:
+    """Keep the first point of each cube, in the order given; cubes grow until at most so many are left."""
+    points_m, colours = (np.concatenate(each) for each in zip(*parts, strict=True))
+    while True:
+        first = first_in_voxel(points_m, voxel_m)
+        points_m, colours = points_m[first], colours[first]
+        if len(points_m) <= most:
+            return (points_m, colours), voxel_m
+        voxel_m *= 1.2
 
 
 def write_part(
@@ -65,8 +65,8 @@ def write_part(
     used = mask[cloud.pixels[:, 0], cloud.pixels[:, 1]]
     # before the shift float32 would round to fractions of a millimetre, or to centimetres far from the origin
     points_m = (cloud.points_m[used] - world_offset_m).astype(np.float32)
-    part = _thinned([_Part(points_m, cloud.colours[used])], VOXEL_M)
-    write_atomically(path, lambda temporary: np.savez(temporary, points_m=part.points_m, colours=part.colours))
+    (points_m, colours), _ = _thinned([(points_m, cloud.colours[used])], VOXEL_M, len(points_m))
+    write_atomically(path, lambda temporary: np.savez(temporary, points_m=points_m, colours=colours))
 
 
 def merge_parts(parts: Sequence[Path], ply: Path) -> int:
@@ -75,27 +75,19 @@ def merge_parts(parts: Sequence[Path], ply: Path) -> int:
     With none, no file is written.
     """
     voxel_m = VOXEL_M
-    pending, count = [_Part(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))], 0
+    pending: list[_Part] = [(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))]
+    count = 0
     for path in parts:
         stored = read_npz(path, ("points_m", "colours"), _MAX_PART_BYTES)
-        pending.append(_Part(stored["points_m"], stored["colours"]))
-        count += len(pending[-1].points_m)
+        pending.append((stored["points_m"], stored["colours"]))
+        count += len(stored["points_m"])
         if count > _MERGE_AT:
-            pending, count = [_thinned(pending, voxel_m)], 0
-            while len(pending[0].points_m) > _MOST_KEPT * MAX_POINTS:
-                # a drive so long that it would be thinned further in the end, too
-                voxel_m *= 1.2
-                pending = [_thinned(pending, voxel_m)]
-    merged = _thinned(pending, voxel_m)
-    while len(merged.points_m) > MAX_POINTS:
-        voxel_m *= 1.2
-        merged = _thinned([merged], voxel_m)
-    if len(merged.points_m):
-        write_bytes(ply, _ply(merged))
-    return len(merged.points_m)
-
-
-def _ply(part: _Part) -> bytes:
-    kinds = {"x": "<f4", "y": "<f4", "z": "<f4", "red": "u1", "green": "u1", "blue": "u1"}
-    columns = np.hstack((part.points_m, part.colours))
-    return ply_bytes(unstructured_to_structured(columns, np.dtype(list(kinds.items()))))
+            # where more are left, the drive is so long that they would be thinned further in the end, too
+            merged, voxel_m = _thinned(pending, voxel_m, _MOST_KEPT * MAX_POINTS)
+            pending, count = [merged], 0
+    (points_m, colours), _ = _thinned(pending, voxel_m, MAX_POINTS)
+    if len(points_m):
+        kinds = {"x": "<f4", "y": "<f4", "z": "<f4", "red": "u1", "green": "u1", "blue": "u1"}
+        columns = np.hstack((points_m, colours))
+        write_bytes(ply, ply_bytes(unstructured_to_structured(columns, np.dtype(list(kinds.items())))))
+    return len(points_m)

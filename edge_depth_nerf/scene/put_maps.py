@@ -78,7 +78,7 @@ def write_maps(
             if name not in pictures or name in written:
                 fault = "is of no frame of" if name not in pictures else "comes twice for"
                 raise InputError(f"{name}: a {words} {fault} {found.path}. Give one for every file_path in it.")
-            metres = usable_distance(found, pictures[name], metres, words, some_empty)
+            metres = _usable(found, pictures[name], metres, words, some_empty)
             write_distance_png(partial / targets[name], metres)
             written.add(name)
             if progress and task is not None:
@@ -106,20 +106,10 @@ def write_maps(
     write_json(found.path, meta)
 
 
-def usable_distance(
-    scene: SceneFolder,
-    picture: ScenePicture,
-    metres: Float[np.ndarray, "h w"],
-    words: str = "monocular map",
-    may_be_empty: bool = False,
+def _usable(
+    scene: SceneFolder, picture: ScenePicture, metres: Float[np.ndarray, "h w"], words: str, may_be_empty: bool
 ) -> Float[np.ndarray, "h w"]:
-    """Leave out of a map of metres along the ray what is no distance to anything, or outside the lens and the mask.
-
-    Errors call the map `words`.
-
-    Raises:
-        InputError: the map has another size than its camera, or nothing is left and it may not be empty.
-    """
+    """Leave out of a map what is no distance to anything, or outside the lens and the mask; errors call it `words`."""
     size = (picture.lens.width, picture.lens.height)
     if metres.shape != size[::-1]:
         raise InputError(

@@ -41,7 +41,6 @@ from edge_depth_nerf.scene.format import (
     LAYERS,
     TRANSFORMS,
     DepthKind,
-    is_own_scene,
     number_of,
     path_keys,
     pose_of,
@@ -355,8 +354,9 @@ def scene_of(
             f"{path}: camera_model is {model!r}; expected one of {', '.join((*PINHOLE_MODELS, FISHEYE_MODEL))}. "
             "Convert the cameras, for example with `edge-depth-nerf process`."
         )
-    own = is_own_scene(meta)
     own_lidar = LAYERS["lidar"].key in frames[0]
+    # monocular maps say nothing about that: `estimate-depth` puts them into other people's scenes, too
+    own = own_lidar or "world_offset_m" in meta
     held_out, split_known = _held_out(meta)
     numbers = _frame_numbers(frames)
     pictures = [
@@ -365,8 +365,7 @@ def scene_of(
     ]
     given = Counter(key for frame in frames for key in path_keys() if key in frame)
     if depth_metres_per_count is None:
-        declared = meta.get("depth_unit_scale_factor", 1e-3)
-        depth_metres_per_count = number_of(declared, f"{path}: depth_unit_scale_factor")
+        depth_metres_per_count = float(meta.get("depth_unit_scale_factor", 1e-3))
     if depth_kind == "auto":
         depth_kind = "distance" if own or model == FISHEYE_MODEL else "z_depth"
     return SceneFolder(
@@ -374,7 +373,7 @@ def scene_of(
         camera_model=model,
         own=own,
         meta={key: value for key, value in meta.items() if key != "frames"},
-        theta_max_rad=math.radians(number_of(meta.get("theta_max_deg", 180.0), f"{path}: theta_max_deg")),
+        theta_max_rad=math.radians(meta.get("theta_max_deg", 180.0)),
         crop_radius_px=meta.get("fisheye_crop_radius") if model == FISHEYE_MODEL else None,
         # of this project's own key both are known
         lidar_metres_per_count=1 / DISTANCE_STEPS_PER_METRE if own_lidar else depth_metres_per_count,
@@ -399,7 +398,7 @@ def _picture(
         position_m=pose[:3, 3],
         rotation=pose[:3, :3],
         held_out=held_out,
-        timestamp_s=None if time is None else number_of(time, f"{path}: {name}: timestamp_s"),
+        timestamp_s=None if time is None else float(time),
         # a scene has one kind of LiDAR maps: its first frame's
         files=_files(frame, path.parent, LAYERS["lidar"].key in meta["frames"][0]),
     )
@@ -436,13 +435,11 @@ def _lens(meta: dict[str, Any], frame: dict[str, Any], model: str, path: Path) -
     of_all = any(key in meta for key in ("k1", "k2", "k3", "p1", "p2", DISTORTION_PARAMS))
     given = meta if of_all else frame
     values = given.get(DISTORTION_PARAMS, [given.get(key, 0.0) for key in DISTORTION])
-    distortion = [number_of(value, f"{where}: {key}") for key, value in zip(DISTORTION, values, strict=True)]
+    distortion = dict(zip(DISTORTION, map(float, values), strict=True))
     width, height, fx, fy, cx, cy = size_and_focal
-    k1, k2, k3, k4, p1, p2 = distortion
+    kind = KannalaBrandt if model == FISHEYE_MODEL else Pinhole
     with found_in(where):
-        if model == FISHEYE_MODEL:
-            return KannalaBrandt(int(width), int(height), fx, fy, cx, cy, k1, k2, k3, k4, p1, p2)
-        return Pinhole(int(width), int(height), fx, fy, cx, cy, k1, k2, p1, p2, k3, k4)
+        return kind(int(width), int(height), fx, fy, cx, cy, **distortion)
 
 
 def _files(frame: dict[str, Any], folder: Path, own_lidar: bool) -> dict[str, Path]:

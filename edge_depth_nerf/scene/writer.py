@@ -25,7 +25,7 @@ import functools
 import math
 import re
 import shutil
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -98,7 +98,7 @@ class FrameContent:
     """H×W×3 RGB."""
     mask: NDArray[np.bool_] | None = None
     """This frame's own mask, True = use; the camera's mask is applied as well."""
-    lidar: DistanceMap | None = None
+    lidar: NDArray[np.float32] | NDArray[np.float64] | None = None
     """What the mask hides is removed."""
     mono: DistanceMap | None = None
     beams: DistanceMap | None = None
@@ -289,15 +289,20 @@ def write_scene(
     left_out = {(item.camera, item.frame) for item in tolerance.left_out}
     frames = [frame for frame in frames if (frame.camera, frame.frame) not in left_out]
     _check_split(frames)
-    if work.cloud:
-        _write_cloud(output, frames)
+    if work.cloud and not merge_parts(
+        [output / _cloud_path(frame) for frame in frames if not frame.held_out], output / POINTS
+    ):
+        raise InputError(
+            f"{output}: no LiDAR point lies in any training picture. Check the calibration from the scanner to "
+            "the cameras, and the masks (255 = use the pixel)."
+        )
     content = _transforms(cameras, fits, frames, shifted, layers, offset, theta_max_deg, source)
     if scanners:
         content[SCANNERS] = {scanner.name: scanner.entry(output) for scanner in scanners}
-    for name, maps in later.items():
-        content[name] = maps.entry
+    for name, (entry, files) in later.items():
+        content[name] = entry
         for frame in content["frames"]:
-            frame[LAYERS[name].key] = maps.of_pictures[frame["file_path"]]
+            frame[LAYERS[name].key] = files[frame["file_path"]]
     _keep_left_out(output, tolerance)
     write_json(output / TRANSFORMS, content)
     shutil.rmtree(output / _PARTIAL, ignore_errors=True)
@@ -319,15 +324,6 @@ def world_offset_m(frames: Sequence[SceneFrame]) -> Float64[np.ndarray, "3"]:
     """Give the scene's origin in the recording's world: whole metres near the mean camera."""
     # adding zero turns -0.0 into 0.0
     return np.round(np.mean([frame.camera_to_world[:3, 3] for frame in frames], axis=0)) + 0.0
-
-
-def _write_cloud(output: Path, frames: Sequence[SceneFrame]) -> None:
-    parts = [output / _cloud_path(frame) for frame in frames if not frame.held_out]
-    if not merge_parts(parts, output / POINTS):
-        raise InputError(
-            f"{output}: no LiDAR point lies in any training picture. Check the calibration from the scanner to "
-            "the cameras, and the masks (255 = use the pixel)."
-        )
 
 
 def _keep_left_out(output: Path, tolerance: Tolerance) -> None:
@@ -363,9 +359,9 @@ def _check(
         if not re.fullmatch(r"\w[\w.-]*", name):
             raise InputError(f"camera {name!r}: expected a name of letters, digits, _ and -; it becomes a folder.")
     for camera in cameras:
-        size = (camera.original.height, camera.original.width)
-        if camera.mask is not None and camera.mask.shape != size:
-            raise InputError(_size_error(f"the mask of camera {camera.name}", camera.mask.shape, size))
+        if camera.mask is not None:
+            size = (camera.original.height, camera.original.width)
+            _check_size(f"the mask of camera {camera.name}", camera.mask.shape, size)
     for item in (*frames, *shifted):
         where = f"frame {item.frame} of {item.camera}"
         if item.camera not in by_name:
@@ -383,11 +379,12 @@ def _check_split(frames: Sequence[SceneFrame]) -> None:
         raise InputError("all frames are held out; no frame is left for training.")
 
 
-def _size_error(what: str, found: tuple[int, ...], expected: tuple[int, int]) -> str:
-    return (
-        f"{what}: {'×'.join(map(str, reversed(found[:2])))} pixels, expected {expected[1]}×{expected[0]} as its camera "
-        "has. Make it in the size of the pictures."
-    )
+def _check_size(what: str, found: tuple[int, ...], expected: tuple[int, int]) -> None:
+    if found != expected:
+        raise InputError(
+            f"{what}: {'×'.join(map(str, reversed(found[:2])))} pixels, expected {expected[1]}×{expected[0]} as its "
+            "camera has. Make it in the size of the pictures."
+        )
 
 
 def open_scene(output: Path, source: Mapping[str, Any]) -> None:
@@ -518,11 +515,7 @@ def _rounded(camera: KannalaBrandt | Pinhole) -> KannalaBrandt:
 
 def _off_pixel_centre(camera: KannalaBrandt) -> KannalaBrandt:
     """Move the principal point off a pixel's centre: nerfstudio's fisheye ray is 0/0 exactly there."""
-
-    def near_centre(coordinate: float) -> bool:
-        return abs(coordinate - 0.5 - round(coordinate - 0.5)) < 5e-4
-
-    if near_centre(camera.cx) and near_centre(camera.cy):
+    if all(abs(place - 0.5 - round(place - 0.5)) < 5e-4 for place in (camera.cx, camera.cy)):
         return replace(camera, cx=round(camera.cx - 0.5) + 0.501)
     return camera
 
@@ -653,23 +646,17 @@ def _write_frame(
                 f"{where}: has no {layer}, but every other frame of this scene has one. Give it for all or none."
             )
 
-    _write_map(files["image"], content.image, size, f"{where}: the picture", distance=False)
-    mask = camera_mask
+    mask, words = camera_mask, {layer: f"{where}: its {LAYERS[layer].words.removesuffix('s')}" for layer in files}
     if "mask" in files and content.mask is not None:
-        if content.mask.shape != size:
-            raise InputError(_size_error(f"{where}: its mask", content.mask.shape, size))
+        _check_size(words["mask"], content.mask.shape, size)
         mask = camera_mask & content.mask
         write_mask(files["mask"], mask)
     if "lidar" in files and content.lidar is not None:
-        lidar = read_distance_png(content.lidar) if isinstance(content.lidar, Path) else content.lidar
-        if lidar.shape != size:
-            raise InputError(_size_error(f"{where}: its LiDAR map", lidar.shape, size))
-        write_distance_png(files["lidar"], np.where(mask, lidar, 0.0))
-    for layer, what in (("mono", "monocular map"), ("beams", "held-out beams"), ("truth_distance", "true distance")):
-        if layer in files:
-            _write_map(files[layer], getattr(content, layer), size, f"{where}: its {what}", distance=True)
-    if "truth_rgb" in files and content.truth_rgb is not None:
-        _write_map(files["truth_rgb"], content.truth_rgb, size, f"{where}: its true picture", distance=False)
+        _check_size(words["lidar"], content.lidar.shape, size)
+        write_distance_png(files["lidar"], np.where(mask, content.lidar, 0.0))
+    for layer in (layer for layer in files if layer not in ("mask", "lidar")):
+        is_distance = LAYERS[layer].kind == "distance"
+        _write_map(files[layer], getattr(content, layer), size, words[layer], distance=is_distance)
     if CLOUD in layers and not frame.held_out:
         if content.cloud is None:
             raise InputError(f"{where}: has no cloud, but every other training frame of this scene has one.")
@@ -695,55 +682,35 @@ def _write_map(path: Path, content: Picture | DistanceMap, size: tuple[int, int]
                 write_bytes(path, read_png_bytes(content))
                 return
         content = read_distance_png(content) if distance else read_image(content)
-    if content.shape[:2] != size:
-        raise InputError(_size_error(what, content.shape, size))
+    _check_size(what, content.shape[:2], size)
     (write_distance_png if distance else write_png)(path, content)
 
 
 # ---- transforms.json -------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _LaterMaps:
-    """Maps of a source of depth that were put into the scene since it was written."""
-
-    entry: Any
-    """Where they come from."""
-    of_pictures: dict[str, str]
-    """File of each picture's map."""
-
-
-def _maps_put_in_later(written: Path) -> dict[str, _LaterMaps]:
-    """Find what a transforms.json says of such maps, by layer, in its order."""
-    if not written.is_file():
-        return {}
-    there = read_transforms(written)
-    found = {}
-    for name in filter(later_layers().__contains__, there):
-        key = LAYERS[name].key
-        of_pictures = {frame["file_path"]: frame[key] for frame in there["frames"] if key in frame}
-        found[name] = _LaterMaps(there[name], of_pictures)
-    return found
-
-
 def _kept_later_maps(
     output: Path, frames: Sequence[SceneFrame], shifted: Sequence[ShiftedView], layers: Collection[str]
-) -> tuple[dict[str, _LaterMaps], _Work, list[str]]:
-    """Find which maps that were put in later still fit the pictures, and what is to be written."""
+) -> tuple[dict[str, tuple[Any, dict[str, str]]], _Work, list[str]]:
+    """Find which maps that were put in since the scene was written still fit the pictures, and what is to be written.
+
+    Of the maps, by layer, it gives where they come from, and the file of each picture's.
+    """
     work, notices, kept = _pending(output, frames, shifted, layers), [], {}
     fresh = not (work.frames or work.shifted)
-    images = [_frame_files(frame, ())["image"] for frame in frames]
-    for name, later in _maps_put_in_later(output / TRANSFORMS).items():
-        files = [later.of_pictures.get(image) for image in images]
-        if fresh and all(file is not None and (output / file).is_file() for file in files):
-            kept[name] = later
+    there = read_transforms(output / TRANSFORMS) if (output / TRANSFORMS).is_file() else {}
+    for name in filter(later_layers().__contains__, there):
+        files = {frame["file_path"]: frame.get(LAYERS[name].key) for frame in there["frames"]}
+        needed = [files.get(_frame_files(frame, ())["image"]) for frame in frames]
+        if fresh and all(file is not None and (output / file).is_file() for file in needed):
+            kept[name] = there[name], files
             continue
-        by_motion = "They are made again, unless --no-motion is given."
-        remedy = {
-            "mono": "Those of the drive's own network are made again. Add others again with `edge-depth-nerf "
-            "estimate-depth`.",
-            **dict.fromkeys(("motion", "motion_sigma", "motion_around"), by_motion),
-        }.get(name, "Add them again.")
+        remedy = "Add them again."
+        if name == "mono":
+            remedy = "Those of the drive's own network are made again. Add others again with `edge-depth-nerf "
+            remedy += "estimate-depth`."
+        elif name.startswith("motion"):
+            remedy = "They are made again, unless --no-motion is given."
         of_what = "estimated monocular maps" if name == "mono" else f"{LAYERS[name].words} put in later"
         notices.append(
             f"The {of_what} of this scene are removed: one is missing, or pictures or masks are new. {remedy}"
@@ -792,12 +759,9 @@ def _transforms(
     if CLOUD in layers:
         content["ply_file_path"] = POINTS
     if shifted:
-        ordered = sorted(shifted, key=lambda item: (item.metres, item.camera, item.frame))
-        distances = sorted({item.metres for item in shifted})
-        content["shifted_views"] = {
-            f"{metres:g}": [_shifted_entry(item, offset) for item in ordered if item.metres == metres]
-            for metres in distances
-        }
+        content["shifted_views"] = defaultdict(list)
+        for item in sorted(shifted, key=lambda item: (item.metres, item.camera, item.frame)):
+            content["shifted_views"][f"{item.metres:g}"].append(_shifted_entry(item, offset))
     return content
 
 
