@@ -8,17 +8,12 @@ from pathlib import Path
 
 import tyro
 
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import require
 from edge_depth_nerf.compare.methods import GRID, METHODS, MethodName, Preset, Setting, Sigma, check_name
 from edge_depth_nerf.jobs.cluster_address import check_address
 
 LEAST_LAMBDAS, LEAST_SIGMAS = 4, 3
 """A search over less says little."""
-
-
-def _require(fine: bool, found: str, expected: str) -> None:
-    if not fine:
-        raise InputError(f"{found}: expected {expected}.")
 
 
 def _words(values: tuple[object, ...]) -> str:
@@ -52,22 +47,22 @@ class TrainingOptions:
         Raises:
             InputError: an option is out of its range, or two do not go together.
         """
-        _require(len(self.scenes) > 0, "no scene", "at least one scene folder")
-        _require(self.steps is None or self.steps >= 1, f"--steps {self.steps}", "1 or more")
-        _require(self.jobs is None or self.jobs >= 1, f"--jobs {self.jobs}", "1 or more")
+        require(len(self.scenes) > 0, "no scene", "at least one scene folder")
+        require(self.steps is None or self.steps >= 1, f"--steps {self.steps}", "1 or more")
+        require(self.jobs is None or self.jobs >= 1, f"--jobs {self.jobs}", "1 or more")
         check_address(self.cluster)
-        _require(
+        require(
             self.jobs is None or self.cluster is None,
             "--jobs with --cluster",
             "one of them: a cluster runs one training per worker",
         )
-        _require(len(self.seeds) > 0 and min(self.seeds) >= 0, f"--seeds {self.seeds}", "at least one, each 0 or more")
+        require(len(self.seeds) > 0 and min(self.seeds) >= 0, f"--seeds {self.seeds}", "at least one, each 0 or more")
         _check_once("methods", self.methods)
         _check_once("seeds", self.seeds)
         for name in self.methods:
             check_name(name)
         literal = [name for name in self.methods if METHODS[name].variant == "paper"]
-        _require(
+        require(
             not literal or self.preset != "paper",
             f"--preset paper --methods {_words(tuple(literal))}",
             "edge, edge-lidar, edge-mono, edge-gaussian, which are of the literal method in this preset",
@@ -75,7 +70,7 @@ class TrainingOptions:
 
 
 def _check_once(name: str, values: tuple[object, ...]) -> None:
-    _require(len(set(values)) == len(values), f"--{name} {_words(values)}", "each once")
+    require(len(set(values)) == len(values), f"--{name} {_words(values)}", "each once")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,12 +104,12 @@ class SearchOptions(TrainingOptions):
         self._check_methods()
         _check_once("lambdas", self.lambdas)
         _check_once("sigmas-m", self.sigmas_m)
-        _require(
+        require(
             len(self.lambdas) >= LEAST_LAMBDAS and all(math.isfinite(x) and x > 0 for x in self.lambdas),
             f"--lambdas {_words(self.lambdas)}",
             f"at least {LEAST_LAMBDAS} positive numbers",
         )
-        _require(
+        require(
             len(self.sigmas_m) >= LEAST_SIGMAS
             and all(x == "own" or (math.isfinite(float(x)) and float(x) > 0) for x in self.sigmas_m),
             f"--sigmas-m {_words(self.sigmas_m)}",
@@ -128,7 +123,7 @@ class SearchOptions(TrainingOptions):
 
     def _check_methods(self) -> None:
         without = tuple(name for name in self.methods if METHODS[name].loss == "none")
-        _require(not without, f"--methods {_words(without)}", "methods with a depth loss")
+        require(not without, f"--methods {_words(without)}", "methods with a depth loss")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,13 +140,13 @@ class GridOptions(SearchOptions):
     def check(self) -> None:
         """Check what can be checked without looking at the disk; raises InputError."""
         super().check()
-        _require(self.preset != "paper", "--preset paper", "lite or full: paper has no extras")
-        _require(len(self.tuning) > 0, "--tuning", "at least one scene that is not evaluated")
+        require(self.preset != "paper", "--preset paper", "lite or full: paper has no extras")
+        require(len(self.tuning) > 0, "--tuning", "at least one scene that is not evaluated")
         both = {scene.resolve() for scene in self.tuning} & {scene.resolve() for scene in self.scenes}
-        _require(not both, f"--tuning {_words(tuple(both))}", "other drives than those that are evaluated")
+        require(not both, f"--tuning {_words(tuple(both))}", "other drives than those that are evaluated")
 
     def _check_methods(self) -> None:
         others = tuple(name for name in self.methods if METHODS[name] not in GRID)
-        _require(not others, f"--methods {_words(others)}", f"cells of the grid, {', '.join(GRID.values())}")
+        require(not others, f"--methods {_words(others)}", f"cells of the grid, {', '.join(GRID.values())}")
         with_loss = any(METHODS[name].loss != "none" for name in self.methods or GRID.values())
-        _require(with_loss, f"--methods {_words(self.methods)}", "at least one that has a loss on the prior")
+        require(with_loss, f"--methods {_words(self.methods)}", "at least one that has a loss on the prior")
