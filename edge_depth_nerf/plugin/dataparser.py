@@ -14,17 +14,16 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import tyro
-from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin.compat import without_undefined_ray
-from edge_depth_nerf.scene.format import INTRINSICS, DepthKind, path_keys, pose_of, read_transforms
+from edge_depth_nerf.plugin.scanning import SceneToModel
+from edge_depth_nerf.scene.format import INTRINSICS, DepthKind, path_keys, read_transforms
 from edge_depth_nerf.scene.reader import scene_of
 
-SUPPORTED_CAMERA_TYPES = (CameraType.PERSPECTIVE, CameraType.FISHEYE)
 SMALLEST_METRES_PER_UNIT = 10.0
 """What stands around the road is some 10 m away, however short the drive."""
 LARGEST_METRES_PER_UNIT = 128.0
@@ -76,30 +75,20 @@ class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig, SceneOptions):
     """How a scene without split files is divided. interval holds out every eval_interval-th picture."""
 
 
-def check_meta(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """Check what nerfstudio's parser takes for granted beyond `read_transforms`; give the list of frames.
+def check_meta(meta: dict[str, Any], path: Path) -> None:
+    """Check what nerfstudio's parser takes for granted beyond `read_transforms` and `scene_of`.
 
     Raises:
-        InputError: an unknown camera model, a frame without pose or intrinsics, a map that only some frames have.
+        InputError: a frame without intrinsics, or a map that only some frames have.
     """
-    model = meta.get("camera_model", "PINHOLE")
-    supported = [name for name, kind in CAMERA_MODEL_TO_TYPE.items() if kind in SUPPORTED_CAMERA_TYPES]
-    if model not in supported:
-        raise InputError(
-            f"{path}: camera_model is {model!r}; expected one of {', '.join(supported)}. "
-            "Convert the cameras, for example with `edge-depth-nerf process`."
-        )
     frames = meta["frames"]
     for number, frame in enumerate(frames):
-        if "transform_matrix" not in frame:
-            raise InputError(f"{path}: frame {number} has no transform_matrix. Every frame needs a picture and a pose.")
         for key in (*INTRINSICS, "w", "h"):
             if meta.get(key) is None and frame.get(key) is None:
                 raise InputError(
                     f"{path}: frame {number} ({frame['file_path']}) has no {key}, nor has the whole scene. "
                     "Every camera needs fl_x, fl_y, cx, cy, w and h in pixels."
                 )
-        pose_of(frame, f"{path}: frame {number} ({frame['file_path']})")
     for key in path_keys():
         missing = [frame["file_path"] for frame in frames if key not in frame]
         if missing and len(missing) < len(frames):
@@ -107,7 +96,6 @@ def check_meta(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
                 f"{path}: {key} is given for {len(frames) - len(missing)} of {len(frames)} frames; it is missing "
                 f"for {', '.join(missing[:3])}{' …' if len(missing) > 3 else ''}. Give it for every frame or none."
             )
-    return frames
 
 
 def check_split(meta: dict[str, Any], path: Path) -> None:
@@ -180,13 +168,8 @@ def _place_exactly(
     positions_m = matrices[:, :3, 3]
     if np.abs(positions_m).max() < FAR_FROM_ORIGIN_M:
         return
-    to_scene, applied = np.eye(4), np.eye(4)
-    to_scene[:3] = outputs.dataparser_transform.double().numpy()
-    of_colmap = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]] if from_colmap else np.eye(4)[:3]
-    applied[:3] = np.array(meta.get("applied_transform", of_colmap), np.float64)[:3]
-    to_scene = to_scene @ np.linalg.inv(applied)
-    scale = outputs.dataparser_scale / meta.get("applied_scale", 1.0)
-    moved = (positions_m @ to_scene[:3, :3].T + to_scene[:3, 3]) * scale
+    of_colmap = {"applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]} if from_colmap else {}
+    moved = SceneToModel.of(outputs, of_colmap | meta).points(positions_m)
     outputs.cameras.camera_to_worlds[:, :, 3] = torch.from_numpy(moved).float()
 
 
@@ -204,9 +187,11 @@ class FisheyeDepth(Nerfstudio):
         """
         path = transforms_path(Path(self.config.data))
         meta = read_transforms(path)
-        frames = check_meta(meta, path)
+        frames = meta["frames"]
+        check_meta(meta, path)
         check_split(meta, path)
         self._check_config(meta, path, split)
+        scene = scene_of(meta, path, self.config.depth_kind, self.config.depth_unit_scale_factor)
         metres_per_unit = self._metres_per_unit(frames)
         if len(frames) == 1 and "train_filenames" not in meta:
             self.config.eval_mode = "all"  # the one picture is for training and for evaluation
@@ -219,7 +204,6 @@ class FisheyeDepth(Nerfstudio):
         by_picture = {self._get_fname(Path(frame["file_path"]), path.parent): frame for frame in frames}
         _place_exactly(outputs, meta, by_picture, (Path(self.config.data) / "colmap/sparse/0").exists())
 
-        scene = scene_of(meta, path, self.config.depth_kind, self.config.depth_unit_scale_factor)
         by_name = {picture.name: picture for picture in scene.pictures}
         pictures = [by_name[by_picture[image]["file_path"]] for image in outputs.image_filenames]
         outputs.metadata.update(
