@@ -132,7 +132,7 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig, PriorSourceOptions
 
 
 class TablePixelSampler:
-    """A pixel sampler of nerfstudio's interface; its exporter sets `num_rays_per_batch`.
+    """Says which records of a table are the next batch; nerfstudio's exporter sets `num_rays_per_batch`.
 
     Processes that train together (torch.distributed) each read a part of every batch. All start at the same record,
     and no two read the same records.
