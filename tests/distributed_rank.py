@@ -81,7 +81,13 @@ def main() -> None:
 
     drawn, surface = [], []
     serve = manager._serve
-    manager._serve = lambda pixels, generator: (surface.append(pixels.indices), serve(pixels, generator))[1]
+
+    def note(pixels: Any, generator: Any) -> Any:
+        if generator is manager.train_ray_generator:
+            surface.append(pixels.indices[len(manager.trained_on) :])
+        return serve(pixels, generator)
+
+    manager._serve = note
     before = {name: p.detach().clone() for name, p in parameters(pipeline.model).items()}
     torch.manual_seed(100 + rank)
     averaged: dict[str, torch.Tensor] = {}
@@ -99,7 +105,7 @@ def main() -> None:
             "mean": mean,
             "averaged": averaged,
             "drawn": drawn,
-            "further": surface[1::2],
+            "further": surface,
             "before": before,
             "after": {name: p.detach().clone() for name, p in parameters(pipeline.model).items()},
             "checkpoints": [str(path) for path in trainer.checkpoint_dir.glob("*.ckpt")],

@@ -93,10 +93,10 @@ def test_surface_pixels_come_for_the_surface_where_the_prior_is_good(tmp_path):
         rgb = data.train_dataset.rgb(int(picture[n]))[int(row[n]), int(column[n])]
         assert torch.equal((batch["surface_image"][n] * 255).round().to(torch.uint8), torch.from_numpy(rgb))
     # the same pixels again after a training is taken up
-    again, _ = (data._surface_sampler.sample(step) for step in (7, 8))
+    again, _ = (data._surface_sampler.draw(step) for step in (7, 8))
     other = manager(scene, train_num_rays_per_batch=100, surface_rays_per_batch=4000)
     other._surface_sampler._first = data._surface_sampler._first
-    assert torch.equal(other._surface_sampler.sample(7).indices, again.indices)
+    assert other._surface_sampler.draw(7) == again
     assert "surface_rays" not in manager(scene, surface_rays_per_batch=0).next_train(0)[1]
 
 
@@ -298,7 +298,7 @@ def test_only_the_tables_used_last_are_kept(tmp_path, monkeypatch):
     for alpha in (0.5, 0.6, 0.7):
         manager(scene, prior=weighted(alpha))
     folder = scene / ".cache" / "pixels"
-    assert len(list(folder.glob("*.npy"))) == len(list(folder.glob("*.json"))) == 3
+    assert len(list(folder.iterdir())) == 3
     # held out, 0.6, 0.7
     before = {path.name for path in folder.glob("*.npy")}
     manager(scene, prior=weighted(0.6))

@@ -55,7 +55,7 @@ def test_lenses_keep_their_kind_and_all_their_terms(tmp_path, camera):
     assert (outputs.cameras.camera_type == kind.value).all()
     pixels = camera.pixel_centres()
     expected, valid = camera.unproject(pixels)
-    ours, _ = FisheyeDepthDataset(outputs).camera(0).unproject(pixels)
+    ours, _ = FisheyeDepthDataset(outputs).pictures[0].lens.unproject(pixels)
     assert torch.allclose(ours[valid], expected[valid], atol=1e-6)
     rays = outputs.cameras[0].generate_rays(camera_indices=0, coords=pixels.flip(-1).float())
     in_world = (ours * torch.tensor([1.0, -1.0, -1.0])) @ outputs.cameras.camera_to_worlds[0].double()[:, :3].T
@@ -258,7 +258,7 @@ def test_distortion_may_be_a_list(tmp_path, of_all):
 
     edit(scene, change)
     outputs = parse(scene)
-    ours = FisheyeDepthDataset(outputs).camera(0).to_dict()
+    ours = FisheyeDepthDataset(outputs).pictures[0].lens.to_dict()
     assert [ours[key] for key in ("k1", "k2", "k3", "k4", "p1", "p2")] == values
     assert outputs.cameras.distortion_params[0].tolist() == pytest.approx(values)
     assert ours["fx"] == outputs.cameras.fx[0] == (8.0 if of_all else 9.0)

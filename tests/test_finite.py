@@ -19,7 +19,7 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import write_distance_png, write_mask, write_png
 from edge_depth_nerf.method import depth_losses
 from edge_depth_nerf.method.depth_losses import EdgeLoss
-from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth, select_prior, sigma_m
+from edge_depth_nerf.method.integration import IntegrationOptions, combined_sigma_m, integrate_depth, select_prior
 from edge_depth_nerf.method.losses import Gaussian, edge_loss, urban_nerf_loss
 from edge_depth_nerf.method.prior import PriorOptions
 from edge_depth_nerf.plugin.step_losses import distortion_loss, interlevel_loss
@@ -103,15 +103,14 @@ def test_integration_is_finite(dtype: torch.dtype, autocast: Any, normalise: Any
     for valid in (torch.ones_like(one), one, torch.zeros_like(one)):
         with torch.autocast("cpu", autocast or torch.bfloat16, enabled=autocast is not None):
             found = integrate_depth(lidar.to(dtype), mono.to(dtype), valid, options)
-            for mode in ("constant", "combined"):
-                sigma = sigma_m(found, mode, mono_m=mono.to(dtype))
-                assert torch.isfinite(sigma).all() and ((sigma > 0) == (found.distance_m > 0)).all(), mode
+            sigma = combined_sigma_m(found, mono.to(dtype))
+            assert torch.isfinite(sigma).all() and ((sigma > 0) == (found.distance_m > 0)).all()
         for values in (found.distance_m, found.spread_m, found.mono_share):
             assert torch.isfinite(values).all() and (values[~valid] == 0).all()
         assert (found.distance_m > 0).sum() <= valid.sum()
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (0, 4, 4), (0, 0)])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (0, 4), (0, 0)])
 def test_maps_of_next_to_nothing(shape: tuple[int, ...]) -> None:
     ones = torch.ones(shape)
     for source in ("integrated", "lidar", "mono"):

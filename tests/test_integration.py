@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from concurrent.futures import ThreadPoolExecutor
+from unittest import mock
 
 import numba
 import numpy as np
@@ -16,11 +17,11 @@ from edge_depth_nerf.method import integration, integration_numba
 from edge_depth_nerf.method.integration import (
     IntegratedDepth,
     IntegrationOptions,
+    combined_sigma_m,
     integrate_by_torch,
     integrate_depth,
     join_estimates,
     select_prior,
-    sigma_m,
     weight_of_errors,
 )
 
@@ -58,14 +59,8 @@ def by_torch(
     lidar: torch.Tensor, mono: torch.Tensor, valid: torch.Tensor, options: IntegrationOptions | None = None
 ) -> IntegratedDepth:
     """What a GPU computes: the equations in torch, where the loops for the CPU go from shift to shift."""
-    shape, dtype = mono.shape, torch.promote_types(torch.promote_types(lidar.dtype, mono.dtype), torch.float32)
-    maps = [each.reshape(shape[:-2].numel(), *shape[-2:]) for each in (lidar, mono, valid)]
-    out = torch.empty(3, *maps[0].shape, dtype=dtype)
-    for i, (lidar_map, mono_map, valid_map) in enumerate(zip(*maps, strict=True)):
-        integrate_by_torch(
-            lidar_map.to(dtype), mono_map.to(dtype), valid_map, options or IntegrationOptions(), out[:, i]
-        )
-    return IntegratedDepth(*out.reshape(3, *shape))
+    with mock.patch.object(integration, "_integrate_on_cpu", integrate_by_torch):
+        return integrate_depth(lidar, mono, valid, options)
 
 
 BOTH = pytest.mark.parametrize("integrate", [integrate_depth, by_torch], ids=["loops", "torch"])
@@ -347,15 +342,12 @@ def test_keep_points(integrate):
     assert torch.equal(kept.distance_m[~lidar_points], averaged.distance_m[~lidar_points])
 
 
-def test_batch_and_strips_change_nothing(monkeypatch):
+def test_strips_change_nothing(monkeypatch):
     maps = [random_maps(seed) for seed in range(6)]
-    lidar, mono, valid = (torch.stack(tensors).reshape(2, 3, 11, 13) for tensors in zip(*maps, strict=True))
-    batched = integrate_depth(lidar, mono, valid)
+    whole = [integrate_depth(*each) for each in maps]
     monkeypatch.setattr(integration, "CPU_STRIP_PIXELS", 5)
-    for i, (lidar_map, mono_map, valid_map) in enumerate(maps):
-        alone = integrate_depth(lidar_map, mono_map, valid_map)
-        of_batch = (getattr(batched, field.name)[i // 3, i % 3] for field in dataclasses.fields(batched))
-        assert_same(alone, IntegratedDepth(*of_batch), atol=1e-6)
+    for each, expected in zip(maps, whole, strict=True):
+        assert_same(integrate_depth(*each), expected, atol=1e-6)
 
 
 def test_leaves_the_number_of_threads_alone():
@@ -400,7 +392,9 @@ def test_distance_factor_is_exact_down_to_the_smallest():
     # w = exp(-x²/2), a = exp(-1/18), and spread² = x²·p·(1 - p), which follows w over 300 powers of ten.
     x = torch.linspace(0, 37.3, 2001, dtype=torch.float64)
     mono = torch.stack([torch.full_like(x, 10), 10 + x], 1)[:, None]
-    spread = integrate_depth(torch.zeros_like(mono), mono, everywhere(mono), IntegrationOptions(kernel_size=3)).spread_m
+    options = IntegrationOptions(kernel_size=3)
+    spreads = [integrate_depth(torch.zeros_like(each), each, everywhere(each), options).spread_m for each in mono]
+    spread = torch.stack(spreads)
     moved = (mono[:, 0, 1] - mono[:, 0, 0]).numpy()
     weight = np.exp(-(moved**2) / 2 - 1 / 18)
     part = weight / (1 + weight)
@@ -416,7 +410,7 @@ def test_compiles_where_nothing_can_be_kept():
     assert integration_numba._compiled(names["double"])(21) == 42
 
 
-@pytest.mark.parametrize("shape", [(0, 4, 5), (4, 0), (2, 4, 5)])
+@pytest.mark.parametrize("shape", [(0, 5), (4, 0), (4, 5)])
 @BOTH
 def test_nothing_valid_is_no_prior(integrate, shape):
     result = integrate(torch.ones(shape), torch.ones(shape), torch.zeros(shape, dtype=torch.bool))
@@ -498,29 +492,21 @@ def test_sigma_by_hand():
     #   0.09 + (0.1 · 12 · 0.5)² + 0.0025   = 0.4525    root 0.672681
     #   0.0001 + (0.1 · 14 · 1)² + 0.0025   = 1.9626    root 1.400928
     torch.testing.assert_close(
-        sigma_m(prior, "combined", mono_m=mono), torch.tensor([[0.0, 0.672681, 1.400928]]), rtol=0, atol=1e-6
+        combined_sigma_m(prior, mono), torch.tensor([[0.0, 0.672681, 1.400928]]), rtol=0, atol=1e-6
     )
-    assert sigma_m(prior, "constant", constant_m=0.5).tolist() == [[0.0, 0.5, 0.5]]
 
 
-@pytest.mark.parametrize("mode", ["constant", "combined"])
-def test_sigma_is_positive_exactly_where_there_is_a_prior(mode):
+def test_sigma_is_positive_exactly_where_there_is_a_prior():
     lidar, mono, valid = random_maps(12)
     prior = integrate_depth(lidar, mono, valid, IntegrationOptions(keep_returns=True))
-    sigma = sigma_m(prior, mode, mono_m=mono)
+    sigma = combined_sigma_m(prior, mono)
     assert torch.isfinite(sigma).all()
     assert torch.equal(sigma > 0, prior.distance_m > 0)
 
 
-def test_combined_sigma_wants_mono_only_where_it_counts(unchecked_types):
-    lidar, mono, valid = random_maps(13)
-    assert float(sigma_m(select_prior("lidar", {"lidar": lidar}, valid), "combined").max()) == pytest.approx(0.05)
-    with pytest.raises(InputError, match="needs mono_m"):
-        sigma_m(integrate_depth(lidar, mono, valid), "combined")
-    with pytest.raises(InputError, match="sigma mode is 'magic'; expected one of 'constant'"):
-        sigma_m(integrate_depth(lidar, mono, valid), "magic")  # pyrefly: ignore[bad-argument-type]
-    with pytest.raises(InputError, match="constant_m is 0"):
-        sigma_m(integrate_depth(lidar, mono, valid), "constant", constant_m=0.0)
+def test_lidar_alone_has_the_floor_for_its_sigma():
+    lidar, _, valid = random_maps(13)
+    assert float(combined_sigma_m(select_prior("lidar", {"lidar": lidar}, valid), lidar).max()) == pytest.approx(0.05)
 
 
 def random_motion(seed: int, mono: torch.Tensor) -> torch.Tensor:
@@ -536,7 +522,7 @@ def random_motion(seed: int, mono: torch.Tensor) -> torch.Tensor:
 def test_three_sources(fields, weight):
     lidar, mono, valid = random_maps(11, dtype=torch.float64)
     motion = random_motion(11, mono)
-    joined = join_estimates(mono, motion, weight)
+    joined = torch.from_numpy(join_estimates(mono.numpy(), motion.numpy(), weight))
     # (1-α) d̂ becomes (1-α) (ρ m + (1-ρ) d̂) where there are both
     expected = mono.clone()
     for place, distance in np.ndenumerate(motion.numpy()):
@@ -553,7 +539,7 @@ def test_three_sources(fields, weight):
 def test_without_motion_the_estimate_stays_bit_for_bit():
     _, mono, _ = random_maps(12)
     for nothing in (torch.zeros_like(mono), torch.full_like(mono, torch.nan), torch.full_like(mono, -1.0)):
-        assert join_estimates(mono, nothing, 0.9).numpy().tobytes() == mono.numpy().tobytes()
+        assert join_estimates(mono.numpy(), nothing.numpy(), 0.9).tobytes() == mono.numpy().tobytes()
 
 
 def test_the_weight_makes_the_mean_best():
@@ -562,4 +548,4 @@ def test_the_weight_makes_the_mean_best():
     assert weight_of_errors(0.01, 0.03) == pytest.approx(0.9)
     assert weight_of_errors(0.1, 0.0) == 0.0
     with pytest.raises(InputError, match="motion_weight"):
-        join_estimates(torch.ones(2, 2), torch.ones(2, 2), 1.2)
+        join_estimates(np.ones((2, 2)), np.ones((2, 2)), 1.2)

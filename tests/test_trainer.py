@@ -173,12 +173,10 @@ def test_detail_appears_when_training_ends(trainer, monkeypatch):
     """The picture that the viewer shows is of before; nothing else asks for another one."""
     asked = []
     viewer = object.__new__(Viewer)
-    monkeypatch.setattr(
-        Viewer, "_trigger_rerender", lambda _: asked.append(trainer.pipeline.drive.layers.shows_detail())
-    )
+    monkeypatch.setattr(Viewer, "_trigger_rerender", lambda _: asked.append(trainer.pipeline.layers.shows_detail()))
     monkeypatch.setattr(Trainer, "_train_complete_viewer", lambda _: asked.append("waits"))
     monkeypatch.setattr(trainer, "viewer_state", viewer)
-    layers = trainer.pipeline.drive.layers
+    layers = trainer.pipeline.layers
     button = SimpleNamespace(visible=True)
     viewer_of_layers = SimpleNamespace(trainer=trainer, pause_train=button, resume_train=button)
     monkeypatch.setattr(layers, "viewer", viewer_of_layers, raising=False)

@@ -10,8 +10,8 @@ import torch
 from test_pixel_table import table_of
 
 from edge_depth_nerf.plugin.datamanager import TablePixelSampler
-from edge_depth_nerf.plugin.pixel_table import PixelTable, decode
-from edge_depth_nerf.plugin.upload import SHARE_OF_MEMORY, Batches, TableOnDevice, Uploads, batches_on
+from edge_depth_nerf.plugin.pixel_table import RECORD, PixelTable, decode
+from edge_depth_nerf.plugin.upload import SHARE_OF_MEMORY, TableOnDevice, Uploads, batches_on
 
 
 @pytest.fixture
@@ -19,9 +19,15 @@ def table(tmp_path) -> PixelTable:
     return table_of(tmp_path / "table.npy", [np.ones((7, 9), bool), np.ones((5, 5), bool)])
 
 
-def next_indices(batches: Batches, samplers: list[TablePixelSampler], step: int = 0) -> torch.Tensor:
+def next_indices(batches: TableOnDevice | Uploads, samplers: list[TablePixelSampler], step: int = 0) -> torch.Tensor:
     batches.set_next([sampler.draw(step) for sampler in samplers])
     return decode(batches.packed()).indices
+
+
+def indices_of(samplers: list[TablePixelSampler], step: int = 0) -> torch.Tensor:
+    """The same, read one after the other."""
+    stretches = [(sampler.table, sampler.draw(step)) for sampler in samplers]
+    return torch.cat([table.batch(each.start, each.count).indices for table, each in stretches])
 
 
 @pytest.mark.parametrize("kind", [TableOnDevice, Uploads])
@@ -32,13 +38,12 @@ def test_batches_of_two_samplers_come_in_one_piece_and_in_order(table, kind):
     batches = kind(table, "cpu")
     for step in (0, 1, 2, 3, 7, 8, 20):  # a training is taken up again, and the end of the table is passed
         found = next_indices(batches, samplers, step)
-        expected = [other.sample(step).indices for other in others]
-        assert torch.equal(found, torch.cat(expected)), step
+        assert torch.equal(found, indices_of(others, step)), step
     # the exporter asks for other numbers of rays
     for each in (samplers[0], others[0]):
         each.num_rays_per_batch = 5
     for _ in range(2):
-        assert torch.equal(next_indices(batches, samplers), torch.cat([other.sample().indices for other in others]))
+        assert torch.equal(next_indices(batches, samplers), indices_of(others))
 
 
 @pytest.mark.parametrize("kind", [TableOnDevice, Uploads])
@@ -82,7 +87,7 @@ def test_the_next_batch_is_read_before_it_is_asked_for(table, monkeypatch):
 
 
 def test_a_table_lies_on_a_gpu_if_it_takes_a_quarter_of_its_free_memory(table, monkeypatch):
-    size = table.nbytes
+    size = len(table) * RECORD.itemsize
     monkeypatch.setattr(TableOnDevice, "__init__", lambda self, table, device: None)
     for free, expected in ((size / SHARE_OF_MEMORY, TableOnDevice), (size / SHARE_OF_MEMORY - 1, Uploads)):
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _, free=free: (free, 2 * free))

@@ -171,7 +171,7 @@ def in_scene_m(pipeline, points: np.ndarray) -> np.ndarray:
 
 def test_clouds_lie_where_the_wall_is(pipeline):
     """The scene is a ball with a wall; cameras stand and look in many ways."""
-    layers = pipeline.drive.layers
+    layers = pipeline.layers
     lidar, prior = layers._lidar(), layers._prior()
     for cloud, within in ((lidar, 0.02), (prior, 0.8)):
         assert len(cloud.points) > 500
@@ -187,7 +187,7 @@ def test_clouds_lie_where_the_wall_is(pipeline):
 
 
 def test_colours_of_clouds(pipeline):
-    cloud = pipeline.drive.layers._prior()
+    cloud = pipeline.layers._prior()
     assert cloud.sigma_m is not None
     assert np.array_equal(cloud.colours("picture"), cloud.rgb)
     by_sigma = cloud.colours("sigma").astype(int).sum(1)
@@ -196,23 +196,21 @@ def test_colours_of_clouds(pipeline):
     lowest, highest = (cloud.colours("height")[index].astype(int) for index in
                        (cloud.height_m.argmin(), cloud.height_m.argmax()))  # fmt: skip
     assert lowest[2] > lowest[0] and highest[0] > highest[2]
-    lidar = pipeline.drive.layers._lidar()
+    lidar = pipeline.layers._lidar()
     assert np.array_equal(lidar.colours("sigma"), lidar.colours("height"))
 
 
 def test_nerfstudio_finds_the_layers(pipeline):
-    assert parse_object(pipeline, ViewerControl, "Custom Elements") == [
-        ("Custom Elements/drive/layers", pipeline.drive.layers)
-    ]
+    assert parse_object(pipeline, ViewerControl, "Custom Elements") == [("Custom Elements/layers", pipeline.layers)]
     # they stand in a folder of their own, and not a second time among its elements
-    assert not [path for path, _ in parse_object(pipeline, ViewerElement, "Custom Elements") if "/drive/" in path]
+    assert not [path for path, _ in parse_object(pipeline, ViewerElement, "Custom Elements") if "/layers/" in path]
     # nothing of it is in a checkpoint
-    assert not [name for name in pipeline.state_dict() if "drive" in name]
+    assert not [name for name in pipeline.state_dict() if "layers.switches" in name or name.startswith("layers")]
 
 
 def test_what_is_not_there_cannot_be_switched_on(tmp_path):
     pipeline = pipeline_of(write_scene(tmp_path, lidar=False, mono=False), "test", depth_loss="none")
-    switches = pipeline.drive.layers.switches
+    switches = pipeline.layers.switches
     assert {name: switch.disabled for name, switch in switches.items()} == {
         **{"lenses": False, "path": False, "lidar": True, "prior": True, "scan": True}
     }
@@ -297,7 +295,7 @@ def test_complete_pictures_alone_have_detail_and_none_during_a_training(machine,
         return {"rgb": torch.zeros(20, 30, 3)}
 
     monkeypatch.setattr(RenderStateMachine, "_render_img", render)
-    layers = pipeline.drive.layers
+    layers = pipeline.layers
     monkeypatch.setattr(layers, "viewer", SimpleNamespace(trainer=None), raising=False)
     machine._shows_detail = layers.shows_detail
     # the training's own setting does not matter here
@@ -321,7 +319,7 @@ def test_complete_pictures_alone_have_detail_and_none_during_a_training(machine,
 
 
 def test_the_switch_of_detail_begins_as_the_training_has_it(scene):
-    assert [pipeline_of(scene, "test", detail=on).drive.layers.detail.value for on in (False, True)] == [False, True]
+    assert [pipeline_of(scene, "test", detail=on).layers.detail.value for on in (False, True)] == [False, True]
 
 
 def test_a_movement_ends_a_fine_picture_and_no_other(machine):
@@ -447,7 +445,7 @@ def training(tmp_path_factory) -> Iterator[SimpleNamespace]:
     thread.start()
     until(lambda: trainer.step > 5)
     yield SimpleNamespace(
-        trainer=trainer, viewer=trainer.viewer_state, layers=trainer.pipeline.drive.layers, scene=folder / "scene"
+        trainer=trainer, viewer=trainer.viewer_state, layers=trainer.pipeline.layers, scene=folder / "scene"
     )
     trainer.shutdown()
     thread.join(TIMEOUT_S)
@@ -456,7 +454,7 @@ def training(tmp_path_factory) -> Iterator[SimpleNamespace]:
 
 @pytest.mark.parametrize("switched_on", [False, True])
 def test_pausing_a_training_asks_for_a_picture_with_detail(training, monkeypatch, switched_on):
-    layers, asked = training.trainer.pipeline.drive.layers, []
+    layers, asked = training.trainer.pipeline.layers, []
     monkeypatch.setattr(Viewer, "_trigger_rerender", lambda viewer: asked.append(viewer))
     # the switch itself would ask, too, from a thread of its own
     monkeypatch.setattr(layers, "detail", SimpleNamespace(value=switched_on))

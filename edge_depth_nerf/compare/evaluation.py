@@ -226,7 +226,8 @@ class ViewEvaluator:
             target = batch.get("truth_rgb", batch["image"])[..., :3].cpu()
             true_m = batch.get("truth_distance_m", batch.get("lidar_distance_m"))
             true_m = None if true_m is None else true_m[..., 0].cpu()
-            angle_deg = torch.rad2deg(torch.from_numpy(np.arccos(np.clip(dataset.rays(number).cos_theta, -1, 1))))
+            cos_theta = dataset.scene.rays(dataset.pictures[number]).cos_theta
+            angle_deg = torch.rad2deg(torch.from_numpy(np.arccos(np.clip(cos_theta, -1, 1))))
             by_angle.update(angle_deg, mask, rgb, target, distance_m, true_m)
             if true_m is not None:
                 by_distance.update(true_m, mask, rgb, target, distance_m, true_m)

@@ -20,8 +20,8 @@ import torch
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.method.integration import check_choice
+from edge_depth_nerf.base.pictures import is_distance
+from edge_depth_nerf.method.integration import check_choice, check_maps
 
 Align = Literal["none", "global", "local"]
 
@@ -65,7 +65,7 @@ class Fit:
 
     def apply(self, mono_m: NDArray[np.float32]) -> NDArray[np.float32]:
         """Apply the fit to distances; what is not a positive number becomes 0."""
-        known = np.isfinite(mono_m) & (mono_m > 0)
+        known = is_distance(mono_m)
         if self == Fit():
             return np.where(known, mono_m, 0).astype(np.float32)
         logs = np.log(np.where(known, mono_m, 1))
@@ -82,7 +82,7 @@ class Aligned:
     fit: Fit
     """The picture's curve, before the local correction."""
     fit_of: Literal["none", "frame", "drive"]
-    """Whose LiDAR points made it. drive: the frame has fewer than LEAST_RETURNS; there is no local correction then."""
+    """Whose LiDAR points made it. drive: the frame has fewer than LEAST_POINTS; there is no local correction then."""
     lidar_points: int
     """Pixels that have both LiDAR and mono."""
 
@@ -95,11 +95,8 @@ def both(
     Raises:
         InputError: the maps differ in size.
     """
-    shapes = {"lidar_m": lidar_m.shape, "mono_m": mono_m.shape, "valid": valid.shape}
-    if len(set(shapes.values())) > 1:
-        found = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
-        raise InputError(f"alignment: found {found}; expected maps of one shape (height, width).")
-    return valid & np.isfinite(lidar_m) & (lidar_m > 0) & np.isfinite(mono_m) & (mono_m > 0)
+    check_maps("alignment", lidar_m=lidar_m, mono_m=mono_m, valid=valid)
+    return valid & is_distance(lidar_m) & is_distance(mono_m)
 
 
 def fit_logs(lidar_m: Float[np.ndarray, "n"], mono_m: Float[np.ndarray, "n"]) -> Fit:
@@ -139,7 +136,7 @@ def align(
         mono_m: monocular distance, 0 = none.
         valid: True where the picture may be used.
         mode: none leaves the map unchanged; global fits scale and exponent; local corrects what they leave.
-        drive_fit: used for a frame with fewer than LEAST_RETURNS LiDAR points; None leaves its map unchanged.
+        drive_fit: used for a frame with fewer than LEAST_POINTS LiDAR points; None leaves its map unchanged.
 
     Raises:
         InputError: the maps differ in size, or the mode is unknown.

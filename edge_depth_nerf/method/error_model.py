@@ -160,6 +160,10 @@ class ErrorModel:
         sigma = features["distance_m"] * np.exp(self.log_sigma(features))
         return np.maximum(sigma, LEAST_SIGMA_M).astype(np.float32)
 
+    def put(self, sigma_m: NDArray[np.float32], where: NDArray[np.bool_], features: Features) -> None:
+        """Write σ̂ of some pixels, metres, into that of all."""
+        sigma_m[where] = self.sigma_m({name: values[where] for name, values in features.items()})
+
 
 def _log_scale(scaled_error: NDArray) -> float:
     """Give the logarithm of half of what 95 % of the errors are within."""
@@ -177,7 +181,7 @@ def fit_error_model(
     knots_of: Mapping[str, tuple[float, ...]] = KNOTS,
     middle: bool = False,
 ) -> ErrorModel | None:
-    """Fit the factors to errors; None for fewer than LEAST_JUDGED.
+    """Fit the factors to errors; None for fewer than LEAST_EVALUATED.
 
     Without any pixel at a LiDAR point the factor there is that of the next pixel over √2: a held-out error consists of
     two, that of the prior and that of the held-out point, and at a point only the latter is left.
@@ -340,14 +344,9 @@ class Calibration:
         assert self.error_model is not None
         sigma = self.error_model.sigma_m(features)
         if self.motion is not None and from_motion is not None:
-            of_motion = {name: values[from_motion] for name, values in features.items()}
-            sigma[from_motion] = self.motion.error_model.sigma_m(of_motion)
-        if self.return_model is None:
-            return sigma
-        at_lidar_point = features["nearest_px"] == 0
-        sigma[at_lidar_point] = self.return_model.sigma_m(
-            {name: values[at_lidar_point] for name, values in features.items()}
-        )
+            self.motion.error_model.put(sigma, from_motion, features)
+        if self.return_model is not None:
+            self.return_model.put(sigma, features["nearest_px"] == 0, features)
         return sigma
 
     def headline(self) -> str:

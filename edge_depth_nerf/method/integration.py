@@ -1,7 +1,7 @@
 """The depth prior: LiDAR and monocular distance integrated into one dense map, and how far each pixel is trusted.
 
-All maps are H×W, metres along the ray, any leading batch dimensions; maps of a batch do not mix. `lidar_m` is D (0 = no
-LiDAR point), `mono_m` D̂ (0 = no estimate), `valid` the pixels that may be used at all (True = use). A pixel outside
+All maps are H×W, metres along the ray. `lidar_m` is D (0 = no LiDAR point), `mono_m` D̂ (0 = no estimate), `valid` the
+pixels that may be used at all (True = use). A pixel outside
 `valid`, or whose d̂ is not a finite positive number, gives no weight and gets none; outside the picture there is
 nothing. Where the prior is 0 there is none. A LiDAR distance that is not finite or not positive counts as none.
 
@@ -40,9 +40,11 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.pictures import is_distance
 
 INTEGRATED = "integrated"
 """The depth source of LiDAR and monocular distance together, and of that from motion where there is any; every other is
@@ -53,7 +55,6 @@ FLOOR_M = 0.05
 """Standard deviation that LiDAR, its calibration and its alignment leave of a prior, metres."""
 Kernel = Literal["edge-aware", "spatial-gaussian"]
 Normalise = Literal["pooled", "residual"]
-SigmaMode = Literal["constant", "combined"]
 
 CPU_STRIP_PIXELS = 1 << 16
 """On the CPU a map is integrated in strips of about so many pixels: the work that a thread takes at a time."""
@@ -75,7 +76,12 @@ def check_choice(where: str, value: str, choices: object) -> None:
         raise InputError(f"{where} is {value!r}; expected one of {', '.join(map(repr, allowed))}.")
 
 
-def _check_number(where: str, value: float, low: float, high: float = math.inf) -> None:
+def check_number(where: str, value: float, low: float, high: float = math.inf) -> None:
+    """Refuse a number that is not finite, or not from `low` to `high`.
+
+    Raises:
+        InputError: names `where`, the number and what is expected.
+    """
     if not (math.isfinite(value) and low <= value <= high):
         expected = f"a finite number from {low:g}" + (f" to {high:g}" if high < math.inf else "")
         raise InputError(f"{where} is {value}; expected {expected}.")
@@ -113,13 +119,13 @@ class IntegrationOptions:
     """Keep a LiDAR point's distance (d̃ = d, spread 0, monocular share 0) instead of averaging it with its window."""
 
     def __post_init__(self) -> None:
-        _check_number("alpha", self.alpha, 0.0, 1.0)
-        _check_number("sigma_space_px", self.sigma_space_px, 1e-3)
-        _check_number("sigma_depth_m", self.sigma_depth_m, 1e-3)
-        _check_number("sigma_depth_growth_per_m", self.sigma_depth_growth_per_m, 0.0)
+        check_number("alpha", self.alpha, 0.0, 1.0)
+        check_number("sigma_space_px", self.sigma_space_px, 1e-3)
+        check_number("sigma_depth_m", self.sigma_depth_m, 1e-3)
+        check_number("sigma_depth_growth_per_m", self.sigma_depth_growth_per_m, 0.0)
         if not (self.kernel_size >= 1 and self.kernel_size % 2 == 1):
             raise InputError(f"kernel_size is {self.kernel_size}; expected an odd whole number of pixels from 1.")
-        _check_number("least_returns", self.least_returns, 0.1)
+        check_number("least_returns", self.least_returns, 0.1)
         check_choice("kernel", self.kernel, Kernel)
         check_choice("normalise", self.normalise, Normalise)
 
@@ -128,20 +134,25 @@ class IntegrationOptions:
 class IntegratedDepth:
     """A prior for every pixel; all three maps are 0 where there is none."""
 
-    distance_m: Float[Tensor, "*batch h w"]
+    distance_m: Float[Tensor, "h w"]
     """d̃, metres along the ray."""
-    spread_m: Float[Tensor, "*batch h w"]
+    spread_m: Float[Tensor, "h w"]
     """Weighted standard deviation, metres, of the values that were averaged into d̃ (weights as in Eq. 5)."""
-    mono_share: Float[Tensor, "*batch h w"]
+    mono_share: Float[Tensor, "h w"]
     """The part of d̃'s weight that came from monocular values, 0 to 1; LiDAR gave the rest. With normalise residual, 1
     less LiDAR's weight over least_returns."""
 
 
-def _check_maps(function: str, **maps: Tensor | None) -> None:
-    shapes = {name: tuple(tensor.shape) for name, tensor in maps.items() if tensor is not None}
-    if len(set(shapes.values())) > 1 or any(len(shape) < 2 for shape in shapes.values()):
+def check_maps(function: str, **maps: Tensor | NDArray) -> None:
+    """Refuse maps that differ in shape, or have no rows and columns.
+
+    Raises:
+        InputError: names `function`, the maps and their shapes.
+    """
+    shapes = {name: tuple(pixels.shape) for name, pixels in maps.items()}
+    if len(set(shapes.values())) > 1 or any(len(shape) != 2 for shape in shapes.values()):
         found = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
-        raise InputError(f"{function}: found {found}; expected maps of one shape (*batch, height, width).")
+        raise InputError(f"{function}: found {found}; expected maps of one shape (height, width).")
 
 
 def _is_distance(distance_m: Tensor) -> Tensor:
@@ -149,8 +160,8 @@ def _is_distance(distance_m: Tensor) -> Tensor:
 
 
 def join_estimates(
-    mono_m: Float[Tensor, "*batch h w"], motion_m: Float[Tensor, "*batch h w"], motion_weight: float
-) -> Float[Tensor, "*batch h w"]:
+    mono_m: Float[np.ndarray, "h w"], motion_m: Float[np.ndarray, "h w"], motion_weight: float
+) -> Float[np.ndarray, "h w"]:
     """Average monocular distances and those from motion, pixel by pixel: the d̂ of three sources.
 
     Args:
@@ -161,11 +172,12 @@ def join_estimates(
     Raises:
         InputError: the maps differ in shape, or the weight is out of its range.
     """
-    _check_maps("join_estimates", mono_m=mono_m, motion_m=motion_m)
-    _check_number("motion_weight", motion_weight, 0.0, 1.0)
-    has_mono, has_motion = _is_distance(mono_m), _is_distance(motion_m)
-    both = torch.where(has_mono & has_motion, motion_weight * motion_m + (1 - motion_weight) * mono_m, mono_m)
-    return torch.where(has_motion & ~has_mono, motion_m, both)
+    check_maps("join_estimates", mono_m=mono_m, motion_m=motion_m)
+    check_number("motion_weight", motion_weight, 0.0, 1.0)
+    has_mono, has_motion = is_distance(mono_m), is_distance(motion_m)
+    with np.errstate(invalid="ignore"):
+        both = np.where(has_mono & has_motion, motion_weight * motion_m + (1 - motion_weight) * mono_m, mono_m)
+    return np.where(has_motion & ~has_mono, motion_m, both)
 
 
 def weight_of_errors(motion_error: float, mono_error: float) -> float:
@@ -177,9 +189,9 @@ def weight_of_errors(motion_error: float, mono_error: float) -> float:
 
 
 def integrate_depth(
-    lidar_m: Float[Tensor, "*batch h w"],
-    mono_m: Float[Tensor, "*batch h w"],
-    valid: Bool[Tensor, "*batch h w"],
+    lidar_m: Float[Tensor, "h w"],
+    mono_m: Float[Tensor, "h w"],
+    valid: Bool[Tensor, "h w"],
     options: IntegrationOptions | None = None,
     device: torch.device | str | None = None,
 ) -> IntegratedDepth:
@@ -205,19 +217,19 @@ def integrate_depth(
         InputError: the maps differ in shape.
     """
     options = options or IntegrationOptions()
-    _check_maps("integrate_depth", lidar_m=lidar_m, mono_m=mono_m, valid=valid)
+    check_maps("integrate_depth", lidar_m=lidar_m, mono_m=mono_m, valid=valid)
     dtype = _work_dtype(lidar_m, mono_m)
     device = mono_m.device if device is None else torch.device(device)
-    flat = (math.prod(mono_m.shape[:-2]), *mono_m.shape[-2:])
-    lidar, mono = (maps.detach().reshape(flat).to(device, dtype) for maps in (lidar_m, mono_m))
-    usable = valid.reshape(flat).to(device)
+    lidar, mono = (pixels.detach().to(device, dtype) for pixels in (lidar_m, mono_m))
+    usable = valid.to(device)
     # empty, not zeros: torch's own threads, once they have filled so many, spin for a while beside ours
-    result = mono.new_empty(3, *flat)
+    result = mono.new_empty(3, *mono.shape)
     integrate = _integrate_on_cpu if device.type == "cpu" else integrate_by_torch
-    for i in range(flat[0]):
-        integrate(lidar[i], mono[i], usable[i], options, result[:, i])
-    distance_m, spread_m, mono_share = result.reshape(3, *mono_m.shape).to(mono_m.device)
-    return IntegratedDepth(distance_m, spread_m, mono_share)
+    integrate(lidar, mono, usable, options, result)
+    if options.keep_returns:
+        points, none = usable & _is_distance(mono) & _is_distance(lidar), torch.zeros_like(lidar)
+        result = torch.where(points, torch.stack([lidar, none, none]), result)
+    return IntegratedDepth(*result.to(mono_m.device))
 
 
 def _work_dtype(*maps: Tensor) -> torch.dtype:
@@ -245,14 +257,14 @@ def _integrate_on_cpu(lidar: Tensor, mono: Tensor, valid: Tensor, options: Integ
     )
     result = [tensor.numpy() for tensor in out]
     if options.normalise == "pooled":
-        share, keeps = float(options.alpha), options.keep_returns
-        _by_strips(functools.partial(integrate_rows, points, estimates, usable, *result, *kernel, share, keeps), mono)
+        share = float(options.alpha)
+        _by_strips(functools.partial(integrate_rows, points, estimates, usable, *result, *kernel, share), mono)
         return
     smooth = [np.empty(mono.shape) for _ in range(3)]
     none = np.zeros_like(points)
-    _by_strips(functools.partial(integrate_rows, none, estimates, usable, *smooth, *kernel, 0.0, False), mono)
-    correct = functools.partial(correct_rows, points, estimates, *smooth[:2], *result, *kernel)
-    _by_strips(functools.partial(correct, float(options.least_returns), options.keep_returns), mono)
+    _by_strips(functools.partial(integrate_rows, none, estimates, usable, *smooth, *kernel, 0.0), mono)
+    few = float(options.least_returns)
+    _by_strips(functools.partial(correct_rows, points, estimates, *smooth[:2], *result, *kernel, few), mono)
 
 
 def _by_strips(integrate: Callable[[int, int], None], mono: Tensor) -> None:
@@ -264,15 +276,9 @@ def _by_strips(integrate: Callable[[int, int], None], mono: Tensor) -> None:
     from edge_depth_nerf.method.integration_numba import TILE
 
     height, width = mono.shape
-    strip = max(1, CPU_STRIP_PIXELS // max(TILE, width))
-    tops = range(0, height, strip)
-    bottoms = [min(top + strip, height) for top in tops]
-    threads = min(torch.get_num_threads(), len(tops))
-    if threads > 1:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(integrate, tops, bottoms))
-    else:
-        list(map(integrate, tops, bottoms))
+    edges = [*range(0, height, max(1, CPU_STRIP_PIXELS // max(TILE, width))), height]
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        list(pool.map(integrate, edges, edges[1:]))
 
 
 def integrate_by_torch(
@@ -300,11 +306,7 @@ def integrate_by_torch(
         residual = torch.where(points, lidar.double() / smooth[0], 1).log()
         corrections = _in_windows(_corrections, torch.stack([centres, residual, points.double()]), options)
         result = _corrected(smooth, corrections)
-    result = result * usable
-    if options.keep_returns:
-        kept = torch.stack([lidar.double(), torch.zeros_like(centres), torch.zeros_like(centres)])
-        result = torch.where(points, kept, result)
-    out.copy_(result)
+    out.copy_(result * usable)
 
 
 def _in_windows(
@@ -377,8 +379,8 @@ def _corrected(smooth: Float[Tensor, "3 h w"], corrections: Float[Tensor, "3 h w
 
 def select_prior(
     depth_source: str,
-    maps: Mapping[str, Float[Tensor, "*batch h w"] | None],
-    valid: Bool[Tensor, "*batch h w"],
+    maps: Mapping[str, Float[Tensor, "h w"] | None],
+    valid: Bool[Tensor, "h w"],
     options: IntegrationOptions | None = None,
     device: torch.device | str | None = None,
 ) -> IntegratedDepth:
@@ -407,51 +409,27 @@ def select_prior(
     if depth_source == INTEGRATED:
         return integrate_depth(found["lidar"], found["mono"], valid, options, device)
     source = found[depth_source]
-    _check_maps("select_prior", source=source, valid=valid)
+    check_maps("select_prior", source=source, valid=valid)
     exists = valid & _is_distance(source)
     distance_m = torch.where(exists, source.detach(), 0).to(_work_dtype(source))
     zero = torch.zeros_like(distance_m)
     return IntegratedDepth(distance_m, zero, zero if depth_source == "lidar" else exists.to(distance_m.dtype))
 
 
-def sigma_m(
-    prior: IntegratedDepth,
-    mode: SigmaMode,
-    *,
-    mono_m: Float[Tensor, "*batch h w"] | None = None,
-    constant_m: float = 1.0,
-) -> Float[Tensor, "*batch h w"]:
-    """Give σ̂, the standard deviation that Eq. 4 grants the prior, for every pixel.
+def combined_sigma_m(prior: IntegratedDepth, mono_m: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Give σ̂, the standard deviation that Eq. 4 grants the prior, where its error was not measured.
 
-    constant   `constant_m`.
-    combined   σ̂² = spread² + (MONO_RELATIVE_ERROR · d̂ · monocular share)² + FLOOR_M².
+    σ̂² = spread² + (MONO_RELATIVE_ERROR · d̂ · monocular share)² + FLOOR_M².
 
     Args:
         prior: what `integrate_depth` or `select_prior` gave.
-        mode: see above.
-        mono_m: D̂, for `combined`; may be None for a prior of LiDAR alone.
-        constant_m: metres.
+        mono_m: d̂; it may be anything where the prior has no monocular share.
 
     Returns:
         Metres, positive where there is a prior and 0 where there is none.
-
-    Raises:
-        InputError: an unknown mode, a constant out of range, or `combined` without mono_m for a prior with a
-            monocular share.
     """
-    check_choice("sigma mode", mode, SigmaMode)
-    _check_number("constant_m", constant_m, 1e-3)
-    distance = prior.distance_m
-    exists = distance > 0
-    if mode == "constant":
-        sigma = torch.full_like(distance, constant_m)
-    else:
-        if mono_m is None:
-            if prior.mono_share.any():
-                raise InputError("sigma_m: mode 'combined' needs mono_m for a prior with a monocular share.")
-            mono_m = torch.zeros_like(distance)
-        _check_maps("sigma_m", mono_m=mono_m, distance_m=distance)
-        # d̂ may be NaN where there is no prior
-        mono_error = torch.where(exists, mono_m.detach(), 0) * prior.mono_share * MONO_RELATIVE_ERROR
-        sigma = (prior.spread_m.square() + mono_error.square() + FLOOR_M**2).sqrt()
+    exists = prior.distance_m > 0
+    # d̂ may be NaN where there is no prior
+    mono_error = torch.where(exists, mono_m, 0) * prior.mono_share * MONO_RELATIVE_ERROR
+    sigma = (prior.spread_m.square() + mono_error.square() + FLOOR_M**2).sqrt()
     return torch.where(exists, sigma, 0)

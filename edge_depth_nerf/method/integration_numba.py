@@ -104,7 +104,6 @@ def integrate_rows(
     growth_per_m,
     lowest_exponent,
     alpha,
-    keep_returns,
     rows_from,
     rows_to,
 ):
@@ -122,7 +121,6 @@ def integrate_rows(
         growth_per_m: σ_d is at least so much times the square of the centre's distance.
         lowest_exponent: distance factors of lower exponents are 0; at least -708, where float64 loses digits.
         alpha: LiDAR's share.
-        keep_returns: a LiDAR point is its own prior.
         rows_from: first row.
         rows_to: row after the last.
     """
@@ -163,9 +161,6 @@ def integrate_rows(
                     )
             for j in range(count):
                 y, x = rows_from + i, left + first + j
-                if keep_returns and tile[3, i + radius, first + j + radius] > 0:
-                    distance[y, x] = lidar[y, x]
-                    continue
                 eta = centres[ETA * TILE + j]
                 if used[first + j + radius] == 0 or not eta > 0:
                     continue
@@ -191,7 +186,6 @@ def correct_rows(
     growth_per_m,
     lowest_exponent,
     least_returns,
-    keep_returns,
     rows_from,
     rows_to,
 ):
@@ -224,9 +218,6 @@ def correct_rows(
     for i in range(rows_to - rows_from):
         y = rows_from + i
         for x in range(width):
-            if keep_returns and smooth[y, x] > 0 and 0 < lidar[y, x] < np.inf:
-                distance[y, x], spread[y, x], mono_share[y, x] = lidar[y, x], 0, 0
-                continue
             distance[y, x], spread[y, x] = smooth[y, x], smooth_spread[y, x]
             mono_share[y, x] = 1 if smooth[y, x] > 0 else 0
             if total[i, x] > 0:

@@ -9,7 +9,7 @@ float64.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, get_args
 
 import torch
@@ -68,9 +68,7 @@ def edge_loss(
     """
     if gaussian not in get_args(Gaussian):
         raise InputError(f"edge_loss: gaussian is {gaussian!r}; expected one of {get_args(Gaussian)}.")
-    _check_shapes(
-        "edge_loss", weights, {"starts_m": starts_m, "ends_m": ends_m}, {"prior_m": prior_m, "sigma_m": sigma_m}
-    )
+    _check_shapes("edge_loss", weights, starts_m=starts_m, ends_m=ends_m, prior_m=prior_m, sigma_m=sigma_m)
     weights, starts, ends, prior, sigma = _exact(weights, starts_m, ends_m, prior_m, sigma_m)
     has_prior = (prior > 0) & torch.isfinite(prior) & (sigma > 0) & torch.isfinite(sigma)
     counts = has_prior[:, None] & (ends > starts) & torch.isfinite(starts) & torch.isfinite(ends)
@@ -159,12 +157,8 @@ def urban_nerf_loss_of_nerfstudio(
     which have no unit, are held against K, which is a density (nerfstudio issues 1793 and 1871). Arguments are those of
     `edge_loss`, with one σ, and E, the expected distance of the ray's final samples.
     """
-    _check_shapes(
-        "urban_nerf_loss_of_nerfstudio",
-        weights,
-        {"starts_m": starts_m, "ends_m": ends_m},
-        {"prior_m": prior_m, "expected_m": expected_m},
-    )
+    given = {"starts_m": starts_m, "ends_m": ends_m, "prior_m": prior_m, "expected_m": expected_m}
+    _check_shapes("urban_nerf_loss_of_nerfstudio", weights, **given)
     deviation_m = _positive("urban_nerf_loss_of_nerfstudio", sigma_m) / REACH_OF_NERFSTUDIO
     has_prior = (prior_m > 0) & torch.isfinite(prior_m)
     prior = torch.where(has_prior, prior_m, 1)
@@ -206,7 +200,7 @@ def urban_nerf_loss(
     Raises:
         InputError: shapes that do not fit, or a σ that is not positive.
     """
-    _check_shapes("urban_nerf_loss", weights, {"starts_m": starts_m, "ends_m": ends_m}, {"prior_m": prior_m})
+    _check_shapes("urban_nerf_loss", weights, starts_m=starts_m, ends_m=ends_m, prior_m=prior_m)
     _positive("urban_nerf_loss", sigma_m)
     weights, starts, ends, prior = _exact(weights, starts_m, ends_m, prior_m)
     has_prior = (prior > 0) & torch.isfinite(prior)
@@ -243,22 +237,20 @@ def sky_loss(weights: Float[Tensor, "rays samples"], sky: Bool[Tensor, "rays"]) 
     return (hit * (sky / sky.sum().clamp(min=1))).sum()
 
 
-def _check_shapes(
-    caller: str, weights: Tensor, per_sample: Mapping[str, Tensor], per_ray: Mapping[str, Tensor]
-) -> None:
-    """Make sure that weights are [rays, samples], and that the others fit.
+def _check_shapes(caller: str, weights: Tensor, **others: Tensor) -> None:
+    """Make sure that weights are [rays, samples], and that the others fit: the samples' ends, or one number a ray.
 
     Raises:
         InputError: they do not.
     """
     if weights.ndim != 2:
         raise InputError(f"{caller}: weights {tuple(weights.shape)}; expected two dimensions, (rays, samples).")
-    rules = {name: weights.shape for name in per_sample} | {name: weights.shape[:1] for name in per_ray}
-    for name, tensor in {**per_sample, **per_ray}.items():
-        if tensor.shape != rules[name]:
+    for name, tensor in others.items():
+        expected = weights.shape if name in ("starts_m", "ends_m") else weights.shape[:1]
+        if tensor.shape != expected:
             raise InputError(
                 f"{caller}: {name} {tuple(tensor.shape)} does not fit weights {tuple(weights.shape)}; "
-                f"expected {tuple(rules[name])}."
+                f"expected {tuple(expected)}."
             )
 
 

@@ -34,11 +34,11 @@ from edge_depth_nerf.method.integration import (
     MONO_RELATIVE_ERROR,
     MOTION_RELATIVE_ERROR,
     IntegrationOptions,
-    SigmaMode,
     check_choice,
+    check_number,
+    combined_sigma_m,
     join_estimates,
     select_prior,
-    sigma_m,
     weight_of_errors,
 )
 
@@ -79,7 +79,7 @@ class PriorOptions:
     """How LiDAR and monocular distance become a prior.
 
     Raises:
-        InputError: a field is not one of its choices.
+        InputError: a field is not one of its choices, or out of its range.
     """
 
     align: Align = "local"
@@ -87,8 +87,8 @@ class PriorOptions:
     changed."""
     sigma_mode: PriorSigma = "calibrated"
     """calibrated: from the errors of the drive's training frames at left-out LiDAR points (see `error_model`),
-    with no prior where the error is unknown; combined if there is no calibration. For the others see
-    `integration.sigma_m`."""
+    with no prior where the error is unknown; combined if there is no calibration. combined: see
+    `integration.combined_sigma_m`. constant: sigma_constant_m."""
     sigma_constant_m: float = 1.0
     """The standard deviation under sigma_mode constant, metres."""
     motion: bool = True
@@ -104,6 +104,7 @@ class PriorOptions:
     def __post_init__(self) -> None:
         check_choice("align", self.align, Align)
         check_choice("sigma_mode", self.sigma_mode, PriorSigma)
+        check_number("sigma_constant_m", self.sigma_constant_m, 1e-3)
 
     def wants_calibration(self, depth_source: str) -> bool:
         """Say whether a calibration of the drive has a part in the prior made of a source."""
@@ -234,7 +235,7 @@ def integrate_frame(
         mono_counts = mask & motion.mono_counts & ~(motion.alone & (motion.distance_m > 0))
         if motion.around_m is not None:
             mono_counts &= ~motion.alone | confirmed(mono_m, motion.around_m)
-        mono_m = _joined(np.where(mono_counts, mono_m, np.float32(0)), motion.distance_m, motion.weight)
+        mono_m = join_estimates(np.where(mono_counts, mono_m, np.float32(0)), motion.distance_m, motion.weight)
         mask = anywhere
     # the spread is wanted at LiDAR points, too, so they are kept afterwards
     integration = dataclasses.replace(options.integration, keep_returns=False)
@@ -288,13 +289,10 @@ def sigma_of(
         return sigma_m
     outside = motion.alone & ~frame.lidar_points
     if beyond.network_model is not None:
-        where = outside & ~frame.from_motion
-        of_network = beyond_features(frame, view)
-        sigma_m[where] = beyond.network_model.sigma_m({name: values[where] for name, values in of_network.items()})
+        beyond.network_model.put(sigma_m, outside & ~frame.from_motion, beyond_features(frame, view))
     if beyond.motion_model is not None:
-        where = outside & frame.from_motion
         of_motion = motion_features(features, motion.distance_m, motion_sigma_m, view.elevation_rad)
-        sigma_m[where] = beyond.motion_model.sigma_m({name: values[where] for name, values in of_motion.items()})
+        beyond.motion_model.put(sigma_m, outside & frame.from_motion, of_motion)
     return sigma_m
 
 
@@ -302,10 +300,6 @@ def beyond_features(frame: IntegratedFrame, view: RayAngles) -> dict[str, NDArra
     """Compute features beyond LiDAR's field, where the nearest known pixel may be one from motion."""
     known = frame.lidar_points | frame.from_motion
     return pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, known, view.theta_rad)
-
-
-def _joined(mono_m: NDArray[np.float32], motion_m: NDArray[np.float32], motion_weight: float) -> NDArray[np.float32]:
-    return join_estimates(torch.from_numpy(mono_m), torch.from_numpy(motion_m), motion_weight).numpy()
 
 
 def motion_map(
@@ -397,15 +391,17 @@ def make_prior(
     if depth_source == INTEGRATED and lidar_m is not None and mono_m is not None:
         aligned = align(lidar_m, mono_m, mask, options.align, calibration.drive_fit if calibration else None).mono_m
         if motion_m is not None:
-            aligned = _joined(aligned, motion_m, weight_of_errors(MOTION_RELATIVE_ERROR, MONO_RELATIVE_ERROR))
+            weight = weight_of_errors(MOTION_RELATIVE_ERROR, MONO_RELATIVE_ERROR)
+            aligned = join_estimates(aligned, motion_m, weight)
         maps = {**maps, "mono": aligned}
     of_source = {name: torch.from_numpy(pixels) for name, pixels in maps.items() if pixels is not None}
     integrated = select_prior(depth_source, of_source, torch.from_numpy(mask), options.integration, device)
-    mode: SigmaMode = "combined" if options.sigma_mode == "calibrated" else options.sigma_mode
+    distance_m = integrated.distance_m.float().numpy()
+    if options.sigma_mode == "constant":
+        return Prior(distance_m, np.where(distance_m > 0, np.float32(options.sigma_constant_m), np.float32(0)))
     # beside LiDAR any source is an estimate, whose error grows with the distance
-    estimate = of_source.get("mono" if depth_source in (INTEGRATED, "lidar") else depth_source)
-    sigma = sigma_m(integrated, mode, mono_m=estimate, constant_m=options.sigma_constant_m)
-    return Prior(integrated.distance_m.float().numpy(), sigma.float().numpy())
+    estimate = of_source["mono" if depth_source == INTEGRATED else depth_source]
+    return Prior(distance_m, combined_sigma_m(integrated, estimate).float().numpy())
 
 
 class PriorCache:

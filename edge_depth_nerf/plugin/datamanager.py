@@ -18,7 +18,7 @@ import os
 import shlex
 import tempfile
 from collections import deque
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,6 +39,7 @@ from rich.progress import track
 from torch import Tensor
 
 from edge_depth_nerf.base.checked_cache import keep_last, used
+from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.method.error_model import Calibration
@@ -67,7 +68,7 @@ from edge_depth_nerf.plugin.pixel_table import (
     write_table,
 )
 from edge_depth_nerf.plugin.ray_table import TableRayGenerator
-from edge_depth_nerf.plugin.upload import Batches, Stretch, batches_on
+from edge_depth_nerf.plugin.upload import Stretch, batches_on
 from edge_depth_nerf.scene.format import LAYERS, depth_sources
 
 KEPT_TABLES = 8
@@ -131,7 +132,7 @@ class FisheyeDepthDataManagerConfig(VanillaDataManagerConfig, PriorSourceOptions
 
 
 class TablePixelSampler:
-    """A pixel sampler of nerfstudio's interface; its exporter sets `num_rays_per_batch`.
+    """Says which records of a table are the next batch; nerfstudio's exporter sets `num_rays_per_batch`.
 
     Processes that train together (torch.distributed) each read a part of every batch. All start at the same record,
     and no two read the same records.
@@ -150,13 +151,8 @@ class TablePixelSampler:
         self._first = int(first)
         self._drawn = 0
 
-    def sample(self, step: int = 0, keep: Callable[..., Any] | None = None) -> PixelBatch:
-        """Read the next batch, or what `PixelTable.batch` keeps of it; at a later step, the batch of that step."""
-        stretch = self.draw(step)
-        return self.table.batch(stretch.start, stretch.count, keep)
-
     def draw(self, step: int = 0) -> Stretch:
-        """Return which records are the next batch."""
+        """Return which records are the next batch; at a later step, the batch of that step."""
         # a resumed training continues at its record; the exporter always passes 0
         self._drawn = max(self._drawn, step * self.num_rays_per_batch)
         start = self._first + self._drawn * self._world_size + self._rank * self.num_rays_per_batch
@@ -192,18 +188,16 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             table = self._table(self.train_dataset, "Integrating depth", with_prior=True)
             self.train_ray_generator = self._ray_generator(self.train_dataset)
         self.train_pixel_sampler = TablePixelSampler(table, self.config.train_num_rays_per_batch, self.device)
-        self._batches: Batches = batches_on(self.device, table)
+        self._batches = batches_on(self.device, table)
         self._surface_sampler = None
         if self.config.surface_rays_per_batch > 0 and table.share_with_prior > 0:
             self._surface_sampler = TablePixelSampler(table, self.config.surface_rays_per_batch, self.device)
         said = f"{len(self.train_dataset)} training pictures, {len(table):,} pixels."
         if table.share_with_prior > 0:
             shares = (f"{SHORT_NAMES.get(name, name)} {share:.0%}" for name, share in table.shares_of_sources.items())
-            said += (
-                f" Prior: {'; '.join([f'{table.share_with_prior:.0%} of them', *filter(None, [', '.join(shares)])])}"
-            )
+            said += f" Prior: {table.share_with_prior:.0%} of them; {', '.join(shares)}"
             said += f"; `edge-depth-nerf inspect {shlex.quote(str(self.config.dataparser.data))}` shows it."
-        CONSOLE.print(said, soft_wrap=True, highlight=False, markup=False)
+        say(CONSOLE, said)
 
     def setup_eval(self) -> None:
         """Write or open the table of held-out pixels (no prior), and prepare the loaders of whole views."""
@@ -218,21 +212,8 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Any]]:
         """Return the rays of the next training batch and their supervision; surface_…: additional pixels, if any."""
-        assert self.train_pixel_sampler is not None
-        if torch.device(self.device).type != "cpu":
-            self.set_next(step)
-            return self.batch_of(self.packed())
-        self.train_count += 1
-        pixels = self.train_pixel_sampler.sample(step)
-        self.trained_on = pixels.indices
-        rays, batch = self._serve(pixels, self.train_ray_generator)
-        if self._surface_sampler is not None:
-            surface_pixels = self._surface_sampler.sample(step, keep=_of_use)
-            # the mean over no pixels would be NaN
-            if len(surface_pixels.sky):
-                batch["surface_rays"], surface = self._serve(surface_pixels, self.train_ray_generator)
-                batch |= _of_surface(surface)
-        return rays, batch
+        self.set_next(step)
+        return self.batch_of(self.packed(), chooses=torch.device(self.device).type == "cpu")
 
     def _samplers(self) -> list[TablePixelSampler]:
         return [sampler for sampler in (self.train_pixel_sampler, self._surface_sampler) if sampler is not None]
@@ -250,21 +231,21 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         """Give the packed records of the training batch and of all additional pixels on the device, at once."""
         return self._batches.packed()
 
-    def batch_of(self, packed: UInt8[Tensor, "n 15"]) -> tuple[RayBundle, dict[str, Any]]:
-        """Return the rays of a packed batch and their supervision, like `next_train`, with all additional pixels."""
+    def batch_of(self, packed: UInt8[Tensor, "n 15"], chooses: bool = False) -> tuple[RayBundle, dict[str, Any]]:
+        """Return the rays of a packed batch and their supervision; with all additional pixels, or the useful ones."""
         assert self.train_pixel_sampler is not None
-        pixels = decode(packed)
-        every, values = self._serve(pixels, self.train_ray_generator)
-        count = self.train_pixel_sampler.num_rays_per_batch
+        pixels, count = decode(packed), self.train_pixel_sampler.num_rays_per_batch
         self.trained_on = pixels.indices[:count]
+        if chooses:
+            pixels = pixels.where(torch.cat([torch.ones(count, dtype=torch.bool), _useful(pixels[count:])[:, 0]]))
+        every, values = self._serve(pixels, self.train_ray_generator)
         batch = {name: value[:count] for name, value in values.items()}
-        if self._surface_sampler is not None:
+        # the mean over no pixels would be NaN
+        if len(every) > count:
             batch["surface_rays"] = every[count:]
             batch |= _of_surface({name: value[count:] for name, value in values.items()})
-            surface_pixels = pixels[count:]
-            batch["surface_counts"] = _of_use(
-                surface_pixels.prior_distance_m, surface_pixels.prior_sigma_m, surface_pixels.sky
-            )
+            if not chooses:
+                batch["surface_counts"] = _useful(pixels[count:])
         return every[:count], batch
 
     def pictures_of(self, rays: Tensor | None = None) -> list[str]:
@@ -277,12 +258,9 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
         """Return the rays of a batch of held-out pixels, and their colours."""
         self.eval_count += 1
         assert self.eval_pixel_sampler is not None
-        if torch.device(self.device).type == "cpu":
-            pixels = self.eval_pixel_sampler.sample()
-        else:
-            stretch = self.eval_pixel_sampler.draw()
-            pixels = decode(self.eval_pixel_sampler.table.packed(stretch.start, stretch.count).to(self.device))
-        return self._serve(pixels, self.eval_ray_generator)
+        stretch = self.eval_pixel_sampler.draw()
+        packed = self.eval_pixel_sampler.table.packed(stretch.start, stretch.count)
+        return self._serve(decode(packed.to(self.device)), self.eval_ray_generator)
 
     def _ray_generator(self, dataset: FisheyeDepthDataset) -> RayGenerator:
         """Return the table of rays if the cameras allow one, else nerfstudio's generator."""
@@ -335,7 +313,7 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
             table = PixelTable(path)
             used(path)
             return table
-        except (OSError, ValueError, KeyError, InputError):
+        except (OSError, InputError):
             pass  # absent or incomplete: it is made now
         if not _writable(path.parent):
             # the scene folder is read-only: the table is deleted with this object
@@ -355,16 +333,16 @@ class FisheyeDepthDataManager(VanillaDataManager[FisheyeDepthDataset]):
                 f"{most * RECORD.itemsize / 1e9:.2g} GB. Free some space there, or choose another folder with "
                 "--pipeline.datamanager.cache-dir."
             ) from error
-        _remove_old(path.parent)
+        keep_last(path.parent, "*.npy", KEPT_TABLES)
         if cache is not None:
             cache.remove_old(len(dataset))
         return PixelTable(path)
 
 
-def _of_use(distance_m: Tensor, sigma_m: Tensor, sky: Tensor) -> Tensor:
-    """Say whether a pixel shows the sky, or a surface whose prior is not too vague."""
-    clear = sigma_m.sub(distance_m, alpha=SURFACE_SIGMA_SHARE) <= SURFACE_SIGMA_M
-    return sky | (distance_m > 0) & clear
+def _useful(pixels: PixelBatch) -> Tensor:
+    """Say whether pixels show the sky, or a surface whose prior is not too vague."""
+    clear = pixels.prior_sigma_m.sub(pixels.prior_distance_m, alpha=SURFACE_SIGMA_SHARE) <= SURFACE_SIGMA_M
+    return pixels.sky | (pixels.prior_distance_m > 0) & clear
 
 
 def _of_surface(values: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -443,11 +421,3 @@ def _writable(folder: Path) -> bool:
             return True
     except OSError:
         return False
-
-
-def _remove_old(folder: Path) -> None:
-    """Remove all tables but those used last."""
-    keep_last(folder, "*.npy", KEPT_TABLES)
-    for about in folder.glob("[!.]*.json"):
-        if not about.with_suffix(".npy").exists():
-            about.unlink(missing_ok=True)

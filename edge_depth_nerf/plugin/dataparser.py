@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin.compat import without_undefined_ray
+from edge_depth_nerf.plugin.scanning import SceneToModel
 from edge_depth_nerf.scene.format import DepthKind, read_transforms
 from edge_depth_nerf.scene.reader import scene_of
 
@@ -144,13 +145,8 @@ def _place_exactly(
     positions_m = matrices[:, :3, 3]
     if np.abs(positions_m).max() < FAR_FROM_ORIGIN_M:
         return
-    to_scene, applied = np.eye(4), np.eye(4)
-    to_scene[:3] = outputs.dataparser_transform.double().numpy()
-    of_colmap = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]] if from_colmap else np.eye(4)[:3]
-    applied[:3] = np.array(meta.get("applied_transform", of_colmap), np.float64)[:3]
-    to_scene = to_scene @ np.linalg.inv(applied)
-    scale = outputs.dataparser_scale / meta.get("applied_scale", 1.0)
-    moved = (positions_m @ to_scene[:3, :3].T + to_scene[:3, 3]) * scale
+    of_colmap = {"applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]} if from_colmap else {}
+    moved = SceneToModel.of(outputs, of_colmap | meta).points(positions_m)
     outputs.cameras.camera_to_worlds[:, :, 3] = torch.from_numpy(moved).float()
 
 

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.cameras import Camera
-from edge_depth_nerf.cameras.rays import Rays
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture
 
 EVALUATED_DISTANCES = ("lidar", "truth_distance")
@@ -53,14 +51,6 @@ class FisheyeDepthDataset(InputDataset):
         }
         """Numbers of the pictures whose whole camera is held out."""
         self._trained_frames = {picture.frame for picture in self.scene.pictures if not picture.held_out}
-
-    def camera(self, image_idx: int) -> Camera:
-        """Give the lens of a picture, as one of the project's own camera models."""
-        return self.pictures[image_idx].lens
-
-    def rays(self, image_idx: int) -> Rays:
-        """Give the rays of a picture's pixels, within the scene's theta_max."""
-        return self.scene.rays(self.pictures[image_idx])
 
     def mask(self, image_idx: int) -> NDArray[np.bool_]:
         """Give H×W, True where the picture may be used: the scene's mask within the validity of the lens."""

@@ -93,7 +93,7 @@ class TrainingDetail:
         poses = self._poses()
         away = (poses[:, :, 3] - origins.mean(dim=0)).norm(dim=-1)
         near = away.argsort(stable=True)[:CONSIDERED].tolist()
-        lenses = [(self.dataset.camera(picture), poses[picture]) for picture in near]
+        lenses = [(self.dataset.pictures[picture].lens, poses[picture]) for picture in near]
         chosen = pictures_that_see(origins, directions, flat, lenses, PICTURES)
         found = carried(origins, directions, flat, [self.of_picture(near[number]) for number in chosen])
         return found.view(*distance.shape[:-1], 3).to(distance)
@@ -118,4 +118,6 @@ class TrainingDetail:
             outputs = model.rendered_alone(camera)
             rgb, distance = outputs["rgb"].to(model.device), outputs["depth"][..., 0].to(model.device)
             beyond = image - rgb if model.exposure is None else model.exposure.beyond(image, rgb, number)
-        return detail_of(self.dataset.camera(number), camera.camera_to_worlds[0], image, beyond, distance, usable)
+        return detail_of(
+            self.dataset.pictures[number].lens, camera.camera_to_worlds[0], image, beyond, distance, usable
+        )

@@ -31,8 +31,10 @@ class PatientGradScaler(torch.amp.GradScaler):
 
         Where gradients are added up over several steps, no optimiser may have stepped: the scale stays.
         """
-        if self._enabled and new_scale is None and not self._some_stepped():
-            return
+        if self._enabled and new_scale is None:
+            states = self._per_optimizer_states.values()
+            if not any(state["found_inf_per_device"] for state in states):
+                return
         super().update(new_scale)
         self.look()
 
@@ -46,10 +48,6 @@ class PatientGradScaler(torch.amp.GradScaler):
         """Drop what an interrupted step has left."""
         if self._enabled:
             self._per_optimizer_states.clear()
-
-    def _some_stepped(self) -> bool:
-        """Say whether an optimiser's gradients were looked at since the last update."""
-        return any(state["found_inf_per_device"] for state in self._per_optimizer_states.values())
 
     def state_dict(self) -> dict[str, Any]:
         """Give what a checkpoint keeps, with the present scale."""

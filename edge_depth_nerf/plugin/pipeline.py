@@ -26,7 +26,7 @@ from edge_depth_nerf.plugin.evaluation import evaluated
 from edge_depth_nerf.plugin.fused.build import kernels_prepared
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel, EdgeDepthNerfModelConfig
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
-from edge_depth_nerf.plugin.viewer import DrivePanel
+from edge_depth_nerf.plugin.viewer import DriveLayers
 from edge_depth_nerf.scene.format import depth_sources, layers_of, read_transforms
 
 FARTHEST_UNITS = 1e6
@@ -117,7 +117,7 @@ class EdgeDepthPipeline(VanillaPipeline):
         assert isinstance(self.model, EdgeDepthNerfModel)
         self.detail = self.model.detail = TrainingDetail(self.model, manager.train_dataset)
         self.model.register_load_state_dict_post_hook(lambda *_: self.detail.forget())
-        self.drive = DrivePanel(manager, model.detail)
+        self.layers = DriveLayers(manager, model.detail)
         self._odd_steps = torch.zeros((), dtype=torch.long, device=device)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
@@ -216,16 +216,14 @@ class EdgeDepthPipeline(VanillaPipeline):
 
     def held_out_psnr(self) -> float:
         """PSNR of the next batch of held-out pixels, dB; it leaves no trace in a training."""
-        model = self.model
-        assert isinstance(model, EdgeDepthNerfModel)
+        model: Any = self.model
         with evaluated(model):
             rays, batch = self.datamanager.next_eval(0)
             return float(model.psnr(model(rays)["rgb"].clamp(0, 1), batch["image"]))
 
     def get_eval_image_metrics_and_images(self, step: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """Figures and pictures of one held-out view."""
-        model = self.model
-        assert isinstance(model, EdgeDepthNerfModel)
+        model: Any = self.model
         model.evaluation.reset()
         metrics, images = super().get_eval_image_metrics_and_images(step)
         return {**metrics, **model.evaluation.pooled()}, images
@@ -239,8 +237,7 @@ class EdgeDepthPipeline(VanillaPipeline):
         get_std: bool = False,
     ) -> dict[str, Any]:
         """Average figures over pictures as nerfstudio does, but AbsRel, RMSE and δ over all their pixels together."""
-        model = self.model
-        assert isinstance(model, EdgeDepthNerfModel)
+        model: Any = self.model
         model.evaluation.reset()
         metrics = super().get_average_image_metrics(data_loader, image_prefix, step, output_path, get_std)
         pooled = model.evaluation.pooled()

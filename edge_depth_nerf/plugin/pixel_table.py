@@ -4,7 +4,8 @@ Pure. Each valid pixel is a record of 15 bytes: colour as uint8, prior distance 
 prior; the sky has no distance and the largest sigma), and where the pixel is. A prior that 16 bits cannot hold, beyond
 255.996 m or below 2 mm, is none; a sigma beyond is kept as 255.996 m. As the order is random, a batch is one
 contiguous read of a memory-mapped file, which needs next to no memory of the process's own. All pixels are passed
-before one comes again.
+before one comes again. Behind the records, a line of JSON counts the pixels with a prior, and those at which each of
+its sources has a distance.
 
 The order is made in two passes: each pixel goes to one of several files, drawn at random; then each file, small enough
 for memory, is shuffled and appended to the whole. That is a uniformly random permutation.
@@ -12,9 +13,10 @@ for memory, is shuffled and appended to the whole. That is a uniformly random pe
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -28,9 +30,9 @@ from torch import Tensor
 
 from edge_depth_nerf.base.checked_cache import is_whole, write_checked
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE, read_json_object, write_json
+from edge_depth_nerf.base.files import DISTANCE_STEPS_PER_METRE
 
-TABLE_VERSION = 5
+TABLE_VERSION = 6
 """Raised whenever the form of the file changes."""
 BUCKET_BYTES = 64 << 20
 """So much is shuffled in memory at once, as long as `MOST_BUCKETS` are enough."""
@@ -108,23 +110,16 @@ class PixelTable:
         """Open a table that `write_table` wrote; all of it is read once, to check that it is unchanged.
 
         Raises:
-            InputError, OSError, ValueError: it is not there, of another version, or not whole.
+            InputError, OSError: it is not there, of another version, or not whole.
         """
         if not is_whole(path, TABLE_VERSION):
             raise InputError(f"{path}: missing, changed, or of another version")
-        about = read_json_object(_about(path), "pixels", "with_prior")
-        records: NDArray = np.load(path, mmap_mode="r", allow_pickle=False)
-        if about.get("version") != TABLE_VERSION or records.dtype != RECORD:
-            raise ValueError(f"{path}: a table of version {about.get('version')}, expected {TABLE_VERSION}")
+        records: np.memmap = np.load(path, mmap_mode="r", allow_pickle=False)
         # fields would be copied one by one
         self._records = np.asarray(records).view(np.uint8).reshape(-1, RECORD.itemsize)
-        if len(self._records) != about["pixels"]:
-            raise ValueError(f"{path}: {len(self._records)} pixels, expected {about['pixels']}")
-        if type(about["with_prior"]) is not int:
-            raise ValueError(f"{path}: with_prior is no number")
-        self._with_prior = about["with_prior"]
-        sources = about.get("sources")
-        self._sources = sources if isinstance(sources, dict) else {}
+        with path.open("rb") as file:
+            file.seek(records.offset + records.nbytes)
+            self._with: dict[str, int] = json.loads(file.readline())
 
     def __len__(self) -> int:
         """Count the records: the valid pixels."""
@@ -133,17 +128,12 @@ class PixelTable:
     @property
     def share_with_prior(self) -> float:
         """Give the share of the records that have a prior."""
-        return self._with_prior / len(self)
+        return self._with["prior"] / len(self)
 
     @property
     def shares_of_sources(self) -> dict[str, float]:
-        """Give the share of the records at which each source has a distance; nothing for tables of before."""
-        return {name: count / len(self) for name, count in self._sources.items() if isinstance(count, int)}
-
-    @property
-    def nbytes(self) -> int:
-        """Count the bytes of all records."""
-        return len(self) * RECORD.itemsize
+        """Give the share of the records at which each source has a distance."""
+        return {name: count / len(self) for name, count in self._with.items() if name != "prior"}
 
     def records(self, start: int, count: int) -> UInt8[np.ndarray, "n 15"]:
         """Give the bytes of `count` records from number `start` on; the first comes after the last."""
@@ -161,18 +151,9 @@ class PixelTable:
         """Read as many records as there is place for, from number `start` on."""
         place.numpy()[:] = self.records(start, len(place))
 
-    def batch(
-        self, start: int, count: int, keep: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None
-    ) -> PixelBatch:
-        """Read `count` pixels from number `start` on; after the last one comes the first again.
-
-        `keep` says whether a pixel is in the batch, by its distance and sigma in metres and whether it shows the sky,
-        [n, 1] each. None: all are.
-        """
-        pixels = decode(self.packed(start, count))
-        if keep is None:
-            return pixels
-        return pixels.where(keep(pixels.prior_distance_m, pixels.prior_sigma_m, pixels.sky)[:, 0])
+    def batch(self, start: int, count: int) -> PixelBatch:
+        """Read `count` pixels from number `start` on; after the last one comes the first again."""
+        return decode(self.packed(start, count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,8 +184,8 @@ def write_table(path: Path, most_pixels: int, pictures: Iterable[PicturePixels])
         InputError: no valid pixel in any picture.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    rng, number, pixels, with_prior = np.random.default_rng(0), 0, 0, 0
-    sources: Counter[str] = Counter()
+    rng, number, pixels = np.random.default_rng(0), 0, 0
+    having: Counter[str] = Counter()
     with ExitStack() as stack:
         buckets: list[IO[bytes]] = [
             stack.enter_context(tempfile.TemporaryFile(dir=path.parent, prefix=".pixels."))
@@ -213,8 +194,8 @@ def write_table(path: Path, most_pixels: int, pictures: Iterable[PicturePixels])
         for number, picture in enumerate(pictures, 1):
             records = _records(picture, number - 1)
             pixels += len(records)
-            with_prior += int((records["distance"] > 0).sum())
-            sources.update({name: int((has & picture.mask).sum()) for name, has in picture.sources.items()})
+            having["prior"] += int((records["distance"] > 0).sum())
+            having.update({name: int((has & picture.mask).sum()) for name, has in picture.sources.items()})
             bucket = rng.integers(len(buckets), size=len(records))
             ordered = records[np.argsort(bucket, kind="stable")]
             ends = np.cumsum(np.bincount(bucket, minlength=len(buckets)))
@@ -235,10 +216,9 @@ def write_table(path: Path, most_pixels: int, pictures: Iterable[PicturePixels])
                 out.write(records[rng.permutation(len(records))].tobytes())
                 file.seek(0)
                 file.truncate()
+            out.write(f"{json.dumps(having)}\n".encode())
 
         write_checked(path, TABLE_VERSION, write)
-    about = {"version": TABLE_VERSION, "pixels": pixels, "with_prior": with_prior, "sources": sources}
-    write_json(_about(path), {**about, "pictures": number})
 
 
 def _records(picture: PicturePixels, number: int) -> NDArray:
@@ -256,8 +236,3 @@ def _records(picture: PicturePixels, number: int) -> NDArray:
     if picture.sky is not None:
         records["sigma"][picture.sky[rows, columns] & (records["distance"] == 0)] = SKY
     return records
-
-
-def _about(path: Path) -> Path:
-    """Name the file that tells that a table is whole."""
-    return path.with_suffix(".json")

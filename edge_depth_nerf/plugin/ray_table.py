@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -57,17 +58,9 @@ def _make(lenses: Tensor, advance: Callable[[int], object]) -> np.ndarray:
     parts = []
     for lens in lenses.float():
         width, height = int(lens[0]), int(lens[1])
-        camera = Cameras(
-            torch.eye(4)[None, :3],
-            fx=lens[3].view(1, 1),
-            fy=lens[4].view(1, 1),
-            cx=lens[5].view(1, 1),
-            cy=lens[6].view(1, 1),
-            width=width,
-            height=height,
-            distortion_params=lens[None, 7:],
-            camera_type=int(lens[2]),
-        )
+        fx, fy, cx, cy = lens[3:7].view(4, 1, 1)
+        pose, kind = torch.eye(4)[None, :3], int(lens[2])
+        camera = Cameras(pose, fx, fy, cx, cy, width, height, distortion_params=lens[None, 7:], camera_type=kind)
         for first in range(0, width * height, STRIP):
             pixels = torch.arange(first, min(first + STRIP, width * height))
             coords = torch.stack([pixels // width, pixels % width], dim=-1) + 0.5
@@ -77,18 +70,15 @@ def _make(lenses: Tensor, advance: Callable[[int], object]) -> np.ndarray:
     return torch.cat(parts).numpy()
 
 
-def _read(path: Path, pixels: int) -> Tensor | None:
-    if not is_whole(path, TABLE_VERSION):
-        return None
-    try:
-        # copy on write: torch wants what it could write to, and nobody does
-        table = np.load(path, mmap_mode="c", allow_pickle=False)
-    except (OSError, ValueError):
-        return None
-    if table.shape != (pixels, 5) or table.dtype != np.float32:
-        return None
-    used(path)
-    return torch.from_numpy(table)
+def _read(path: Path) -> Tensor | None:
+    # another process may remove it meanwhile
+    with suppress(OSError):
+        if is_whole(path, TABLE_VERSION):
+            # copy on write: torch wants what it could write to, and nobody does
+            table = np.load(path, mmap_mode="c", allow_pickle=False)
+            used(path)
+            return torch.from_numpy(table)
+    return None
 
 
 class TableRayGenerator(RayGenerator):
@@ -106,19 +96,16 @@ class TableRayGenerator(RayGenerator):
         pixels = (lenses[:, 0] * lenses[:, 1]).long()
         digest = hashlib.sha256(f"rays {TABLE_VERSION}".encode() + lenses.numpy().tobytes())
         path = folder / f"{digest.hexdigest()[:32]}.npy"
-        table = _read(path, int(pixels.sum()))
+        table = _read(path)
         if table is None:
             with progress_bars(CONSOLE, transient=True) as progress:
                 task = progress.add_task("Making the table of rays (once) …", total=int(pixels.sum()))
                 made = _make(lenses, partial(progress.advance, task))
-            try:
+            with suppress(OSError):
                 write_checked(path, TABLE_VERSION, lambda file: np.save(file, made))
-            except OSError:
-                table = None
-            else:
-                # from the file, so that processes share the memory
-                table = _read(path, len(made))
                 keep_last(folder, "*.npy", KEPT_TABLES)
+            # from the file, so that processes share the memory
+            table = _read(path)
             if table is None:
                 table = torch.from_numpy(made)
         first = torch.cumsum(pixels, 0) - pixels

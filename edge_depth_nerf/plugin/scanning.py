@@ -50,7 +50,8 @@ class SceneToModel:
     @classmethod
     def of(cls, outputs: Any, meta: Mapping[str, Any]) -> SceneToModel:
         """Take a dataparser's outputs on a scene, and its transforms.json, which nerfstudio may have changed."""
-        applied = np.vstack((meta.get("applied_transform", np.eye(4)[:3]), [0, 0, 0, 1])).astype(np.float64)
+        # of three rows or four
+        applied = np.vstack((meta.get("applied_transform", np.eye(4))[:3], [0, 0, 0, 1])).astype(np.float64)
         transform = outputs.dataparser_transform.numpy().astype(np.float64) @ np.linalg.inv(applied)
         scale = float(outputs.dataparser_scale) / float(meta.get("applied_scale", 1.0))
         return cls(transform[:, :3], transform[:, 3], scale)

@@ -9,11 +9,9 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Any, Literal
 
 import torch
@@ -26,8 +24,10 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer import Viewer
 
+from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.errors import STOPPED_STATUS, InputError
 from edge_depth_nerf.base.files import remove_leftovers, write_text
+from edge_depth_nerf.base.interrupts import ctrl_c_put_off
 from edge_depth_nerf.jobs.runs import checkpoints_in, commands_after, newest_checkpoint
 from edge_depth_nerf.kernels.table_adam import TableAdam
 from edge_depth_nerf.kernels.threads import torch_on_one_thread
@@ -72,7 +72,7 @@ class EdgeDepthTrainerConfig(TrainerConfig, TrainingOptions):
         lines = [f"{self.method_name}: {self.max_num_iterations} steps on {self.machine.device_type}, scene {scene}"]
         for name, value in changed_settings(self, all_methods.get(self.method_name)).items():  # pyrefly: ignore
             lines.append(f"  --{name.replace('_', '-')} {value.__qualname__ if isinstance(value, type) else value}")
-        CONSOLE.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
+        say(CONSOLE, "\n".join(lines))
 
     def save_config(self) -> None:
         """Save config.yml as nerfstudio does, but atomically: half a file could not be loaded.
@@ -103,7 +103,6 @@ class EdgeDepthTrainer(Trainer):
         """Initialise it as nerfstudio's Trainer."""
         super().__init__(config, local_rank, world_size)
         self.grad_scaler = PatientGradScaler(enabled=self.use_grad_scaler and self.device != "cpu")  # pyrefly: ignore
-        self._interruption = _Interruption()
         self._last_step: int | None = None  # of this process
         self.graphs: StepGraphs | None = None
         self._progress = _Progress()
@@ -150,12 +149,14 @@ class EdgeDepthTrainer(Trainer):
         if self.world_size > 1 or threading.current_thread() is not threading.main_thread():
             super().train()  # nerfstudio ends the processes of its ranks; only the main thread receives signals
             return
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
-            with self._interruption.watched():
-                super().train()
+            super().train()
         except KeyboardInterrupt:
             if self.training_state != "completed":
                 self._stop()
+        finally:
+            signal.signal(signal.SIGINT, before)
 
     def _stop(self) -> None:
         if self._last_step is None:
@@ -163,24 +164,21 @@ class EdgeDepthTrainer(Trainer):
         else:
             self.save_checkpoint(self._last_step)
             remaining = total_steps(self) - self._last_step - 1
-            how_to_resume = (
-                " To resume, add this to the same command: --load-dir "
-                f"{shlex.quote(str(self.checkpoint_dir))} --max-num-iterations {remaining}"
-            )
-            CONSOLE.print(
-                f"\nStopped after step {self._last_step}; its checkpoint is saved.{how_to_resume if remaining else ''}",
-                soft_wrap=True,
-                highlight=False,
-                markup=False,
-            )
+            said = f"\nStopped after step {self._last_step}; its checkpoint is saved."
+            if remaining:
+                folder = shlex.quote(str(self.checkpoint_dir))
+                said += (
+                    f" To resume, add this to the same command: --load-dir {folder} --max-num-iterations {remaining}"
+                )
+            say(CONSOLE, said)
         raise SystemExit(STOPPED_STATUS) from None
 
     def _train_complete_viewer(self) -> None:
         """End the viewer's training, show detail if its switch asks for it, and wait for Ctrl-C as nerfstudio does."""
         viewer, pipeline = self.viewer_state, self.pipeline
         if isinstance(pipeline, EdgeDepthPipeline) and isinstance(viewer, Viewer):
-            pipeline.drive.layers.end_training()
-            if pipeline.drive.layers.detail.value:
+            pipeline.layers.end_training()
+            if pipeline.layers.detail.value:
                 self.training_state = "completed"
                 viewer._trigger_rerender()
         super()._train_complete_viewer()
@@ -191,8 +189,10 @@ class EdgeDepthTrainer(Trainer):
         Raises:
             InputError: a loss was not finite. The message names the pictures and the last checkpoint.
         """
+        # the fused kernels on the CPU get the threads
+        fused = self.device == "cpu" and getattr(self.pipeline.model, "fused", False)
         try:
-            with self._interruption.put_off(), self._threads():
+            with ctrl_c_put_off(), torch_on_one_thread() if fused else nullcontext():
                 result = None if self.graphs is None else self.graphs.step(step)
                 if result is None:
                     result = super().train_iteration(step)
@@ -225,14 +225,10 @@ class EdgeDepthTrainer(Trainer):
         compares = manager.train_dataset.scene.split_known and manager.config.depth_source != "none"
         commands = commands_after(config, Path(manager.get_datapath()), preset, compares)
         lines = [f"{what}: {command}" for what, command in commands.items()]
-        CONSOLE.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
-
-    def _threads(self) -> AbstractContextManager[None]:
-        """Give the fused kernels on the CPU the threads, and torch one."""
-        fused = self.device == "cpu" and getattr(self.pipeline.model, "fused", False)
-        return torch_on_one_thread() if fused else nullcontext()
+        say(CONSOLE, "\n".join(lines))
 
     @check_main_thread
+    @ctrl_c_put_off()
     def save_checkpoint(self, step: int) -> None:
         """Save into a folder beside the checkpoints, then move the complete file into theirs.
 
@@ -247,10 +243,6 @@ class EdgeDepthTrainer(Trainer):
             raise InputError(
                 f"The parameter {name} is not finite after step {step}, because a gradient was not. {self._kept()}"
             )
-        with self._interruption.put_off():
-            self._save_whole(step)
-
-    def _save_whole(self, step: int) -> None:
         folder = self.checkpoint_dir
         # on the same disk, wherever --relative-model-dir leads
         partial = folder.parent / ".unfinished_checkpoint"
@@ -343,50 +335,12 @@ class _Progress:
             graphs = trainer.graphs is not None and trainer.graphs.recorded > 0
             said += f", {torch.cuda.max_memory_reserved(trainer.device) / 1e9:.1f} GB of GPU memory"
             said += f", {'by' if graphs else 'without'} CUDA graphs"
-        CONSOLE.print(said + (f"; {_duration(step_s * left)} to go" if left else ""), highlight=False, soft_wrap=True)
+        say(CONSOLE, said + (f"; {_duration(step_s * left)} to go" if left else ""))
         self._said = step, time.perf_counter()
 
 
 def _duration(seconds: float) -> str:
     """Write a duration as a person would say it."""
-    return (
-        f"{seconds:.0f} s"
-        if seconds < 120
-        else f"{seconds / 60:.0f} min"
-        if seconds < 7200
-        else f"{seconds / 3600:.1f} h"
-    )
-
-
-class _Interruption:
-    """Delays Ctrl-C until a step or a checkpoint is complete."""
-
-    def __init__(self) -> None:
-        self._busy = False
-        self._asked = False
-
-    @contextmanager
-    def watched(self) -> Iterator[None]:
-        """Handle Ctrl-C here, and restore the former handler afterwards."""
-        before = signal.signal(signal.SIGINT, self._on_signal)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, before)
-
-    @contextmanager
-    def put_off(self) -> Iterator[None]:
-        """Raise KeyboardInterrupt after the block, if Ctrl-C was pressed during it."""
-        self._busy = True
-        try:
-            yield
-        finally:
-            self._busy = False
-        if self._asked:
-            self._asked = False
-            raise KeyboardInterrupt
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if not self._busy:
-            raise KeyboardInterrupt
-        self._asked = True
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

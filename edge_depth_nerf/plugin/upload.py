@@ -1,6 +1,6 @@
-"""Batches on a GPU: from a table that lies there, or read ahead into pinned memory, so that nothing waits.
+"""Batches on a device: from a table that lies on the GPU, or read ahead, for a GPU into pinned memory.
 
-Host-facing. The records of a batch are 15 bytes a pixel; they are unpacked on the device.
+Host-facing. Nothing waits for a batch. Its records are 15 bytes a pixel; they are unpacked on the device.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -29,22 +28,6 @@ class Stretch:
     count: int
     to_next: int
     """From their start to that of the stretch which is read after them."""
-
-
-@runtime_checkable
-class Batches(Protocol):
-    """Gives batches on a device."""
-
-    def set_next(self, stretches: Sequence[Stretch]) -> None:
-        """Say of which records the next batch consists."""
-        ...
-
-    def packed(self) -> UInt8[Tensor, "n 15"]:
-        """Give the bytes of the next batch, one stretch after the other; once after each `set_next`.
-
-        It does nothing on the host, so that it can be recorded: then each replay gives the batch that is next.
-        """
-        ...
 
 
 class TableOnDevice:
@@ -72,7 +55,10 @@ class TableOnDevice:
         self._next = [start + step for start, step in zip(starts, steps, strict=True)]
 
     def packed(self) -> UInt8[Tensor, "n 15"]:
-        """Give the bytes of the next batch, and go on to the one after it."""
+        """Give the bytes of the next batch, one stretch after the other, and go on to the one after it.
+
+        It does nothing on the host, so that it can be recorded: then each replay gives the batch that is next.
+        """
         rows = (self._starts[self._of] + self._places) % len(self._records)
         self._starts += self._steps
         return self._records[rows]
@@ -117,7 +103,7 @@ class Uploads:
         self._ahead = following, self._reader.submit(self._read, following)
 
     def packed(self) -> UInt8[Tensor, "n 15"]:
-        """Give the bytes of the next batch."""
+        """Give the bytes of the next batch, once after each `set_next`."""
         return self._batch
 
     def _read(self, stretches: Sequence[Stretch]) -> None:
@@ -128,10 +114,10 @@ class Uploads:
             self._table.read_into(place, each.start)
 
 
-def batches_on(device: torch.device | str, table: PixelTable) -> Batches:
+def batches_on(device: torch.device | str, table: PixelTable) -> TableOnDevice | Uploads:
     """Give what serves a table's batches on a device."""
     if torch.device(device).type == "cuda":
         free, _ = torch.cuda.mem_get_info(torch.device(device))
-        if table.nbytes <= SHARE_OF_MEMORY * free:
+        if len(table) * RECORD.itemsize <= SHARE_OF_MEMORY * free:
             return TableOnDevice(table, device)
     return Uploads(table, device)

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from threading import Thread
@@ -186,22 +186,16 @@ class DriveLayers(ViewerControl):
         sampler = manager.train_pixel_sampler
         has_prior = sampler is not None and sampler.table.share_with_prior > 0
         has_lidar = "lidar" in manager.train_dataset.sources()
-        self.switches = {
-            "lidar": self._switch("LiDAR points", "lidar", False, "LiDAR points of the training pictures", has_lidar),
-            "prior": self._switch(
-                "Depth prior", "prior", False, "The distances that supervise the training", has_prior
-            ),
-            "scan": self._switch(
-                "Rendered scan",
-                "scan",
-                False,
-                "The distances that the model now gives along a recorded sweep, a held-out one if there is any",
-                bool(manager.train_dataset.scene.meta.get(SCANNERS)),
-            ),
-            # from inside one, its picture would look like a perfect rendering
-            "lenses": self._switch("Lenses", "lenses", False, "What each camera sees; replaces nerfstudio's pyramids"),
-            "path": self._switch("Path", "path", True, "A line through the positions of each camera"),
+        has_sweeps = bool(manager.train_dataset.scene.meta.get(SCANNERS))
+        of_scan = "The distances that the model now gives along a recorded sweep, a held-out one if there is any"
+        layers = {
+            "lidar": ("LiDAR points", "LiDAR points of the training pictures", has_lidar),
+            "prior": ("Depth prior", "The distances that supervise the training", has_prior),
+            "scan": ("Rendered scan", of_scan, has_sweeps),
+            "lenses": ("Lenses", "What each camera sees; replaces nerfstudio's pyramids", True),
+            "path": ("Path", "A line through the positions of each camera", True),
         }
+        self.switches = {layer: self._switch(layer, *about) for layer, about in layers.items()}
         self.meaning = ViewerDropdown(
             "Colour of points",
             COLOURS[0],
@@ -218,14 +212,22 @@ class DriveLayers(ViewerControl):
         self._frames: dict[str, viser.FrameHandle] = {}
         self._clouds: dict[str, Cloud] = {}
 
-    def _switch(self, label: str, layer: str, shown: bool, hint: str, available: bool = True) -> ViewerCheckbox:
+    def _switch(self, layer: str, label: str, hint: str, available: bool) -> ViewerCheckbox:
         hint = hint if available else "This training has none"
+        # from inside a lens, its picture would look like a perfect rendering; clouds take time
+        shown = layer == "path"
         return ViewerCheckbox(label, shown, disabled=not available, cb_hook=lambda _: self._update(layer), hint=hint)
 
     def _setup(self, viewer: Viewer) -> None:
         """Install the panel, and draw the layers that are on at the start."""
         super()._setup(viewer)
-        self._install(viewer)
+        gui = viewer.viser_server.gui
+        # above the panel's tabs, where they are visible at once
+        with gui.add_folder(FOLDER, order=viewer.stats_markdown.order + 0.5):
+            for element in (*self.switches.values(), self.meaning, self.detail):
+                element.install(viewer.viser_server)
+        labels = ", ".join(switch.name for switch in self.switches.values() if not switch.disabled)
+        CONSOLE.print(f"The viewer's panel switches these layers on and off: {labels}.")
         viewer.viser_server.on_client_connect(self._welcome)
         # created before nerfstudio's frusta, this parent hides all of them
         viewer.viser_server.scene.add_frame(HOST_FRUSTA, show_axes=False, visible=False)
@@ -237,15 +239,6 @@ class DriveLayers(ViewerControl):
         viewer.hide_images.visible = viewer.show_images.visible = False
         for layer in self.switches:
             self._update(layer)
-
-    def _install(self, viewer: Viewer) -> None:
-        """Put the layers' switches above the panel's tabs, where they are visible at once."""
-        gui = viewer.viser_server.gui
-        with gui.add_folder(FOLDER, order=viewer.stats_markdown.order + 0.5):
-            for element in (*self.switches.values(), self.meaning, self.detail):
-                element.install(viewer.viser_server)
-        labels = ", ".join(switch.name for switch in self.switches.values() if not switch.disabled)
-        CONSOLE.print(f"The viewer's panel switches these layers on and off: {labels}.")
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Start a browser at a training picture: the middle one of the drive's first camera."""
@@ -316,22 +309,18 @@ class DriveLayers(ViewerControl):
             pose = dataset.cameras.camera_to_worlds[index].double().cpu().numpy()
             lens = self.viser_server.scene.add_glb(
                 f"{node}/{index:05d}",
-                _glb(dataset.camera(index), limit_rad, dataset.rgb(index), radius),
+                _glb(dataset.pictures[index].lens, limit_rad, dataset.rgb(index), radius),
                 wxyz=_viser_rotation(pose).wxyz,
                 position=pose[:, 3] * VISER_NERFSTUDIO_SCALE_RATIO,
             )
-            lens.on_click(self._go_there(index))
+            lens.on_click(partial(self._go_there, index))
 
-    def _go_there(self, index: int) -> Callable[[viser.SceneNodePointerEvent[viser.GlbHandle]], None]:
-        """Return a handler that moves the browser to the camera, as a click on nerfstudio's own frusta does."""
-
-        def on_click(event: viser.SceneNodePointerEvent[viser.GlbHandle]) -> None:
-            with event.client.atomic():
-                event.client.camera.position = event.target.position
-                event.client.camera.wxyz = event.target.wxyz
-                self.viewer.current_camera_idx = index
-
-        return on_click
+    def _go_there(self, index: int, event: viser.SceneNodePointerEvent[viser.GlbHandle]) -> None:
+        """Move the browser to the camera, as a click on nerfstudio's own frusta does."""
+        with event.client.atomic():
+            event.client.camera.position = event.target.position
+            event.client.camera.wxyz = event.target.wxyz
+            self.viewer.current_camera_idx = index
 
     def _draw_path(self, node: str) -> None:
         """Draw one line for each folder of pictures, with the held-out ones."""
@@ -430,11 +419,3 @@ class DriveLayers(ViewerControl):
     def _units(self, length_m: float) -> float:
         """Convert a length to the browser's units."""
         return length_m / self.manager.train_dataset.metadata["metres_per_unit"] * VISER_NERFSTUDIO_SCALE_RATIO
-
-
-class DrivePanel(torch.nn.Module):
-    """A module that contains the layers: nerfstudio searches the pipeline's modules for viewer controls."""
-
-    def __init__(self, manager: FisheyeDepthDataManager, detail: bool) -> None:
-        super().__init__()
-        self.layers = DriveLayers(manager, detail)
