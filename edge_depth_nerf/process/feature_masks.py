@@ -1,4 +1,4 @@
-"""The pictures of a recording as they are searched for features, and where."""
+"""A recording's pictures, made ready for a search of features, and where they may be searched."""
 
 from __future__ import annotations
 
