@@ -51,6 +51,20 @@ def with_orientation(path: Path, pixels: np.ndarray, orientation: int) -> Path:
     return path
 
 
+def test_the_head_of_a_png_decodes_no_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    turned = with_orientation(tmp_path / "turned.png", smooth(), 6)
+    plain = tmp_path / "plain.png"
+    Image.fromarray(smooth()).save(plain)
+    content = turned.read_bytes()
+    begin = content.index(b"eXIf") - 4
+    chunk = content[begin : begin + 12 + int.from_bytes(content[begin : begin + 4], "big")]
+    behind = tmp_path / "behind.png"
+    behind.write_bytes(content.replace(chunk, b"")[:-12] + chunk + content[-12:])
+    assert picture_head(behind).orientation == 6
+    monkeypatch.setattr("PIL.ImageFile.ImageFile.load", lambda _: pytest.fail("decoded"))
+    assert [picture_head(path).orientation for path in (plain, turned)] == [1, 6]
+
+
 @pytest.mark.parametrize(
     ("content", "keys"),
     [

@@ -13,7 +13,7 @@ PACKAGE = ROOT / "edge_depth_nerf"
 
 MOST_LINES = {
     "edge_depth_nerf": 675,
-    "edge_depth_nerf/base": 1_570,
+    "edge_depth_nerf/base": 1_575,
     "edge_depth_nerf/cameras": 1_325,
     "edge_depth_nerf/compare": 2_870,
     "edge_depth_nerf/demo": 325,

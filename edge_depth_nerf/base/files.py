@@ -229,7 +229,10 @@ def picture_head(path: Path) -> PictureHead:
         with Image.open(path, formats=_FORMATS) as image:
             kind, (width, height) = str(image.format), image.size
             check_pixels(width, height, str(path))
-            turned = 1 if kind == "TIFF" else image.getexif().get(_EXIF_ORIENTATION, 1)
+            # Pillow decodes all of a PNG to look for EXIF behind the pixels
+            decodes = kind == "PNG" and b"eXIf" in path.read_bytes()
+            exif = image.getexif() if decodes or kind != "PNG" else Image.Image.getexif(image)
+            turned = 1 if kind == "TIFF" else exif.get(_EXIF_ORIENTATION, 1)
     except InputError:
         raise
     except Exception as error:  # Pillow raises whatever its readers meet
