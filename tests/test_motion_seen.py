@@ -177,7 +177,7 @@ def covered(calibration, maps, view, where) -> tuple[float, float]:
         evaluated = missing & (prior.distance_m > 0)
         # but for what lies farther from all that is known than was measured, or is wrong by more than a tenth
         assert evaluated.sum() > 0.65 * missing.sum()
-        scaled.append((np.abs(prior.distance_m - truth) / prior.sigma_m)[evaluated])
+        scaled.append(np.abs(prior.distance_m - truth)[evaluated] / prior.sigma_m[evaluated])
     every = np.concatenate(scaled)
     return float(np.mean(every < 1)), float(np.mean(every < 2))
 
@@ -288,7 +288,7 @@ def test_sigma_of_motion_beyond_the_field_is_that_measured_in_it():
     for truth, of_source in maps:
         prior = make_prior(of_source, np.ones(SIZE, bool), "integrated", PriorOptions(), calibration, view)
         inner = beyond & (of_source["motion"] > 0)
-        scaled.append((np.abs(prior.distance_m - truth) / prior.sigma_m)[inner])
+        scaled.append(np.abs(prior.distance_m - truth)[inner] / prior.sigma_m[inner])
         assert (prior.sigma_m[inner] >= 0.02).all()
     every = np.concatenate(scaled)
     # the floor of sigma counts here: rather too large
