@@ -83,18 +83,6 @@ def check_weights_of_what_is_not_finite() -> None:
     assert_near(gradients[0], gradients[1], 1e-6)
 
 
-@pytest.mark.parametrize(("rays", "samples"), [(0, 5), (5, 0), (3, 1), (700, 97)])
-def test_weights_on_the_cpu_are_those_of_the_formula(rays: int, samples: int) -> None:
-    densities, deltas = 10 ** (4 * torch.rand(rays, samples) - 2), torch.rand(rays, samples) / max(samples, 1)
-    if rays > 4 and samples > 4:
-        densities[0], densities[1, 3], densities[2, 4] = 0, float("inf"), float("nan")
-    expected = torch_weights(densities, deltas)
-    torch.testing.assert_close(ray_numba.weights_from_densities(densities, deltas), expected, rtol=1e-5, atol=1e-6)
-    found = ray_numba.weights_from_densities(densities.requires_grad_(), deltas)
-    assert found.requires_grad
-    torch.testing.assert_close(found.detach(), expected, rtol=1e-5, atol=1e-6)
-
-
 def exact_shares(weights: torch.Tensor, edges: torch.Tensor, placed: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Which share of the weights lies before places, and up to them, in float64; what rounds to one counts for both.
 

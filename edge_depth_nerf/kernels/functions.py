@@ -204,8 +204,7 @@ DENSITY = Function(
     on_gpu=on_gpu("density", lambda: _triton().pointwise.density, formulas.density, _outputs, 1e-5),
 )
 WEIGHTS = Function(
-    lambda: _numba().ray.weights_from_densities,
-    on_gpu(
+    on_gpu=on_gpu(
         "weights", lambda: _triton().ray.weights_from_densities, formulas.weights_from_densities, _optical, 1e-5, MOST
     ),
 )

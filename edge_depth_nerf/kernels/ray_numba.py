@@ -1,4 +1,4 @@
-"""Sums along rays on the CPU, one ray after the other: weights, where samples go, and the loss of the proposals.
+"""Sums along rays on the CPU, one ray after the other: where samples go, and the loss of the proposals.
 
 The weights of a ray's samples are a histogram over its intervals. torch forms cumulative sums, searches in them and
 gathers from them, each a pass over all rays; here two sorted lists are walked once, side by side. Cumulative sums are
@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from edge_depth_nerf.kernels import formulas
 from edge_depth_nerf.kernels.compiled import compiled
 from edge_depth_nerf.kernels.gradients import sloped
 from edge_depth_nerf.kernels.threads import in_parts
@@ -84,34 +83,6 @@ def sample_pdf(
     numbers = weights.shape[1] + wanted.shape[1]
     in_parts(lambda first, last: _sample_pdf(*arguments, first, last), len(weights), LEAST_WALKED // numbers)
     return placed
-
-
-@compiled(error_model="numpy")
-@no_type_check
-def _weights(densities, deltas, weights, first, last):
-    samples = densities.shape[1]
-    depths, reached = np.empty(samples, np.float32), np.empty(samples, np.float32)
-    for ray in range(first, last):
-        running = 0.0
-        for k in range(samples):
-            depths[k] = densities[ray, k] * deltas[ray, k]
-            reached[k] = np.float32(running)
-            running += depths[k]
-        for k in range(samples):
-            found = (ONE - np.exp(-depths[k])) * np.exp(-reached[k])
-            weights[ray, k] = found if found == found else ZERO
-
-
-def weights_from_densities(
-    densities: Float[Tensor, "rays samples"], deltas: Float[Tensor, "rays samples"]
-) -> Float[Tensor, "rays samples"]:
-    """Compute rendering weights of samples of these lengths, float32; what is not a number weighs nothing."""
-    if torch.is_grad_enabled() and densities.requires_grad:
-        return formulas.weights_from_densities(densities, deltas)
-    weights = torch.empty(densities.shape)
-    arrays = *(each.detach().contiguous().numpy() for each in (densities, deltas)), weights.numpy()
-    in_parts(lambda first, last: _weights(*arrays, first, last), len(weights), LEAST_WALKED // max(1, weights.shape[1]))
-    return weights
 
 
 @compiled()
