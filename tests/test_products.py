@@ -107,6 +107,19 @@ def test_a_density_beyond_half_precision_spoils_no_colour(density):
     assert found[0][1].isfinite().all() and all(map(torch.equal, found[0][1:], found[1][1:]))
 
 
+@pytest.mark.parametrize("where", [0, 1])
+def test_layers_beyond_half_precision_spoil_no_colour(where):
+    """Two outputs of the hidden layer, or of the last one, that half precision has no number for."""
+    torch.manual_seed(0)
+    first, second = scaled(*WIDTHS["first"]), scaled(*WIDTHS["second"])
+    with torch.no_grad():
+        first[1][where][2:4] = torch.tensor([1e6, -1e6]) if where else 1e6
+    encoded, of_rays = torch.randn(370, 8, requires_grad=True), torch.randn(130, 3)
+    before, colours = products.field(encoded, of_rays, RUNS, first, second, 3, torch.float16)
+    assert colours.isfinite().all() and not before.isnan().any()
+    assert not torch.autograd.grad(before.float().clamp(-10, 10).sum() + colours.sum(), first[0][1])[0].isnan().any()
+
+
 def test_there_is_no_second_derivative():
     weights, biases = layers(4, 3, 2)
     x = torch.randn(5, 4, requires_grad=True)

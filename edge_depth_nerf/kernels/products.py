@@ -20,6 +20,8 @@ from edge_depth_nerf.kernels.gradients import once
 
 Layers = tuple[Sequence[Tensor], Sequence[Tensor]]
 """Weights, [out, in], and biases, [out], of a network."""
+LARGEST_FEATURE = 1024.0
+"""What enters the second network of a field: more than scenes have, and little enough for half precision behind it."""
 _ALL = slice(None)
 
 
@@ -46,11 +48,13 @@ def _in_type(parameters: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor]:
     return found
 
 
-def _forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], follow: bool) -> list[Tensor]:
-    """Give what enters each layer, if it is to be kept for backward, and what the last one gives."""
+def _forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], follow: bool, hold: bool) -> list[Tensor]:
+    """Give what enters each layer, all with `follow`, and what the last one gives; `hold` keeps hidden ones finite."""
     entering = [x]
     for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
         entering.append(_with_relu(bias, entering[-1], weight.t()))
+        if hold:
+            entering[-1].clamp_(max=torch.finfo(x.dtype).max)
         entering = entering if follow else entering[-1:]
     return [*entering, torch.addmm(biases[-1], entering[-1], weights[-1].t())]
 
@@ -78,7 +82,7 @@ class _Network(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, dtype: torch.dtype, follow: bool, *parameters: Tensor) -> Tensor:
         count = len(parameters) // 2
         made = _in_type(parameters, dtype)
-        *entering, found = _forward(x.detach().to(dtype), made[:count], made[count:], follow)
+        *entering, found = _forward(x.detach().to(dtype), made[:count], made[count:], follow, False)
         if follow:
             ctx.count, ctx.made = count, made
             ctx.save_for_backward(x, *parameters, *entering)
@@ -123,19 +127,20 @@ class _Field(torch.autograd.Function):
         runs, directions, count, dtype, follow = form
         made = _in_type(parameters, dtype)
         weights, biases = made[: len(made) // 2], made[len(made) // 2 :]
-        *entering, features = _forward(encoded.detach().to(dtype), weights[:count], biases[:count], follow)
+        # where the sky is empty what it gives grows without end: losses see the skyline alone, and sharpen it
+        half = dtype == torch.float16
+        *entering, features = _forward(encoded.detach().to(dtype), weights[:count], biases[:count], follow, half)
         rows = weights[count]
-        # the density is no input of the second network: 0, with the weight 0, as infinity times 0 would be none
+        # the density is no input of the second network: it has the weight 0
         weights[count] = torch.cat([rows[:, :directions], rows.new_zeros(len(rows), 1), rows[:, directions:]], 1)
         own = slice(directions, directions + features.shape[1])
         points = features.new_empty(len(features), weights[count].shape[1])
-        points[:, directions].zero_()
-        points[:, directions + 1 : own.stop].copy_(features[:, 1:])
+        torch.clamp(features, -LARGEST_FEATURE, LARGEST_FEATURE, out=points[:, own])
         for of_points, of_run in _by_run(runs, points, of_rays.detach()):
             of_points[..., :directions].copy_(of_run[..., :directions])
             if own.stop < points.shape[1]:
                 of_points[..., own.stop :].copy_(of_run[..., directions:])
-        *behind, before_sigmoid = _forward(points, weights[count:], biases[count:], follow)
+        *behind, before_sigmoid = _forward(points, weights[count:], biases[count:], follow, False)
         colours = torch.sigmoid(before_sigmoid, out=torch.empty_like(before_sigmoid, dtype=torch.float32))
         if follow:
             ctx.form, ctx.weights, ctx.own = form, weights, own
