@@ -16,7 +16,7 @@ from edge_depth_nerf.plugin.exposure import Gains
 pytestmark = pytest.mark.slow
 
 MOST = {
-    "full, a view": (175, 8.0),
+    "full, a view": (174, 11.8),
     "full": (302, 2.41),
     "full, proposals rest": (248, 1.81),
     "full, poses": (753, 2.7),

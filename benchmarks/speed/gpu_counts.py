@@ -282,6 +282,7 @@ def fake_trainer(gpu: FakeGpu, method: str, scene: Path, folder: Path, **changes
     config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = scene
     config.pipeline.datamanager.cache_dir = folder / "cache"
     config.pipeline.model.implementation = changes.get("implementation", "fused")
+    config.pipeline.model.eval_num_rays_per_chunk = methods.RAYS_AT_ONCE["cuda"]
     if changes.get("poses"):
         config.pipeline.model.camera_optimizer.mode = "SO3xR3"
     torch.manual_seed(0)

@@ -56,6 +56,8 @@ class FusedAdamConfig(AdamOptimizerConfig):
 
 
 METHOD_FILE = "nerfstudio_method.toml"
+RAYS_AT_ONCE = {"cpu": 8192, "cuda": 49_152}
+"""Of a view. A CPU has them in its caches; for a GPU the host launches as many kernels for few as for many."""
 
 
 def read_method_file() -> dict[str, Any]:
@@ -67,20 +69,18 @@ def base_config(method_name: str) -> TrainerConfig:
     """Give what all methods share: Adam over the training, fixed poses, a viewer that listens on this machine only."""
 
     def optimiser(warmup: float = 0.0) -> dict[str, Any]:
-        return {
-            "optimizer": FusedAdamConfig(lr=1e-2, eps=1e-15),
-            "scheduler": TrainingScheduleConfig(lr_final=1e-4, warmup_steps=warmup),
-        }
+        scheduler = TrainingScheduleConfig(lr_final=1e-4, warmup_steps=warmup)
+        return {"optimizer": FusedAdamConfig(lr=1e-2, eps=1e-15), "scheduler": scheduler}
 
+    # nerfstudio's default is cuda, also where there is none
+    device_type = "cuda" if torch.cuda.is_available() else "cpu"
+    model = EdgeDepthNerfModelConfig(eval_num_rays_per_chunk=RAYS_AT_ONCE[device_type])
     return EdgeDepthTrainerConfig(
         method_name=method_name,
-        # nerfstudio's default is cuda, also where there is none
-        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
-        pipeline=EdgeDepthPipelineConfig(
-            datamanager=FisheyeDepthDataManagerConfig(), model=EdgeDepthNerfModelConfig(eval_num_rays_per_chunk=1 << 15)
-        ),
+        machine=MachineConfig(device_type=device_type),
+        pipeline=EdgeDepthPipelineConfig(datamanager=FisheyeDepthDataManagerConfig(), model=model),
         optimizers={"proposal_networks": optimiser(), "fields": optimiser(), "camera_opt": optimiser(warmup=0.1)},
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
+        viewer=ViewerConfig(num_rays_per_chunk=model.eval_num_rays_per_chunk, websocket_host="127.0.0.1"),
         vis="viewer",
         # the trainer says where it is, in lines that a file can hold
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
