@@ -64,14 +64,15 @@ def _backward(
     weights: Sequence[Tensor],
     entering: Sequence[Tensor],
     ones: Tensor,
-    into: Layers,
+    into: tuple[Sequence[Tensor], Sequence[Tensor | None]],
     on: slice | None,
 ) -> Tensor | None:
-    """Write the gradients to a network's parameters; give that to some columns of what enters it, if to any."""
+    """Write a network's gradients, but to biases that are None; give that to some columns of what enters it, if any."""
     to_weights, to_biases = into
     for layer in reversed(range(len(weights))):
         torch.mm(gradient.t(), entering[layer], out=to_weights[layer])
-        torch.mm(ones, gradient, out=to_biases[layer][None])
+        if (to_bias := to_biases[layer]) is not None:
+            torch.mm(ones, gradient, out=to_bias[None])
         if layer > 0:
             gradient = torch.ops.aten.threshold_backward(gradient @ weights[layer], entering[layer], 0)
     return None if on is None else gradient @ weights[0][:, on]
@@ -131,11 +132,12 @@ class _Field(torch.autograd.Function):
         half = dtype == torch.float16
         *entering, features = _forward(encoded.detach().to(dtype), weights[:count], biases[:count], follow, half)
         rows = weights[count]
-        # the density is no input of the second network: it has the weight 0
+        # the density is no input of the second network: a one of weight 0 stands there, for the bias's gradient
         weights[count] = torch.cat([rows[:, :directions], rows.new_zeros(len(rows), 1), rows[:, directions:]], 1)
         own = slice(directions, directions + features.shape[1])
         points = features.new_empty(len(features), weights[count].shape[1])
-        torch.clamp(features, -LARGEST_FEATURE, LARGEST_FEATURE, out=points[:, own])
+        points[:, directions].fill_(1)
+        torch.clamp(features[:, 1:], -LARGEST_FEATURE, LARGEST_FEATURE, out=points[:, directions + 1 : own.stop])
         for of_points, of_run in _by_run(runs, points, of_rays.detach()):
             of_points[..., :directions].copy_(of_run[..., :directions])
             if own.stop < points.shape[1]:
@@ -146,8 +148,7 @@ class _Field(torch.autograd.Function):
             ctx.form, ctx.weights, ctx.own = form, weights, own
             ctx.counts = len(parameters), len(entering)
             ctx.save_for_backward(encoded, of_rays, colours, *parameters, *entering, *behind)
-        rays_first, each = runs[0]
-        return features[: rays_first * each, 0], colours
+        return features[: runs[0][0] * runs[0][1], 0], colours
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
@@ -165,19 +166,19 @@ class _Field(torch.autograd.Function):
             gradient = torch.empty_like(colours, dtype=flat.dtype)
             torch.ops.aten.sigmoid_backward.grad_input(to_colours, colours, grad_input=gradient)
             to_rows = torch.empty_like(weights[count])
-            second = [to_rows, *to_weights[count + 1 :]], to_biases[count:]
+            second = [to_rows, *to_weights[count + 1 :]], [None, *to_biases[count + 1 :]]
             learns_rays = ctx.needs_input_grad[1]
             to_points = _backward(gradient, weights[count:], behind, ones, second, _ALL if learns_rays else own)
             assert to_points is not None
             torch.cat([to_rows[:, :directions], to_rows[:, directions + 1 :]], 1, out=to_weights[count])
+            to_biases[count].copy_(to_rows[:, directions])
             to_rays = None
             if learns_rays:
                 parts = _by_run(runs, torch.cat([to_points[:, :directions], to_points[:, own.stop :]], 1), of_rays)
                 to_rays = torch.cat([of_points.sum(1) for of_points, _ in parts]).to(of_rays.dtype)
                 to_points = to_points[:, own]
             to_points[: len(to_before), 0].copy_(to_before)
-            on = _ALL if ctx.needs_input_grad[0] else None
-            first = to_weights[:count], to_biases[:count]
+            first, on = (to_weights[:count], to_biases[:count]), _ALL if ctx.needs_input_grad[0] else None
             to_encoded = _backward(to_points, weights[:count], entering, ones, first, on)
             to_encoded = None if to_encoded is None else to_encoded.to(encoded.dtype)
             return to_encoded, to_rays, *_parts_of(flat.to(parameters[0].dtype), parameters)

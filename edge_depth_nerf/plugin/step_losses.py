@@ -6,7 +6,6 @@ adds up those that its configuration asks for.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, make_dataclass
@@ -45,6 +44,8 @@ else:
 
 LEAST_DISTANCE_M = 1e-6
 """What is nearer is no distance: without a prior it is 0."""
+PROPER = torch.finfo(torch.float32).tiny, torch.finfo(torch.float32).max
+"""Least and largest σ̂ of a prior."""
 SHARP_M = 0.02
 """Standard deviation of a good scanner, metres."""
 
@@ -102,7 +103,7 @@ class PriorLoss:
             step.batch[name][:, 0].to(step.outputs["rgb"].device, torch.float32)
             for name in ("prior_distance_m", "prior_sigma_m")
         )
-        met = step.planes.hold(prior_m) & (sigma_m > 0) & (sigma_m < math.inf)
+        met = step.planes.hold(prior_m) & (sigma_m == sigma_m.clamp(*PROPER))
         prior_m = torch.where(met, prior_m, 0)
         every = [*zip(step.outputs["weights_list"], step.outputs["ray_samples_list"], strict=True)][::-1]
         every = every[:1] if self.final_alone else every

@@ -169,7 +169,8 @@ class FusedFrustums(Frustums):
         """Give the positions in the middle of the samples."""
         if self.offsets is not None:
             return super().get_positions()
-        return torch.addcmul(self.origins, self.directions, torch.lerp(self.starts, self.ends, 0.5))
+        middles = self.starts if self.starts is self.ends else torch.lerp(self.starts, self.ends, 0.5)
+        return torch.addcmul(self.origins, self.directions, middles)
 
 
 def in_a_row(parts: Sequence[Tensor]) -> Tensor:
