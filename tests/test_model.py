@@ -160,9 +160,9 @@ def test_surface_sky_and_falling_weight_are_options_of_any_depth_loss(kind):
         assert float(losses[extra].detach()) == pytest.approx(float(of_edge[extra].detach()), rel=1e-5)
     assert not torch.allclose(outputs["rgb"], plain_outputs["rgb"], atol=1e-2)
     for each, share in ((model, 0.01), (plain, 1.0)):
-        weight = each.depth_weight()
+        weight, surface_weight = each.weights_now()
         each._step = 30_000
-        assert each.depth_weight() == pytest.approx(share * weight)
+        assert each.weights_now() == (pytest.approx(share * weight), surface_weight)
 
 
 def test_without_weight_the_prior_serves_surface_and_sky_alone():
@@ -177,20 +177,20 @@ def colours_at(model, bundle: RayBundle, distance_units) -> torch.Tensor:
     return model.field(places)[FieldHeadNames.RGB][:, 0]
 
 
-def test_the_weight_of_the_depth_loss_falls_over_the_training():
-    model = build(depth_loss_mult=0.5, depth_loss_final=0.01)
+def test_weights_of_depth_and_surfaces_fall_over_the_training():
+    model = build(depth_loss_mult=0.5, depth_loss_final=0.01, surface_loss_final=0.1)
     model._training_steps = 100
-    expected = float(trained_step(model)[1]["edge_loss"])
+    depth, surfaces = (float(step_with_surface(model)[1][name].detach()) for name in ("edge_loss", "surface_loss"))
     (tell,) = (
         callback
-        for callback in model.get_training_callbacks(
-            TrainingCallbackAttributes(optimizers=None, grad_scaler=None, pipeline=None, trainer=None)
-        )
+        for callback in model.get_training_callbacks(TrainingCallbackAttributes(None, None, None, None))
         if callback.func.__name__ == "remember"
     )
     for step, share in ((0, 1.0), (50, 0.1), (100, 0.01), (5000, 0.01)):
         tell.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-        assert float(trained_step(model)[1]["edge_loss"]) == pytest.approx(expected * share, rel=1e-4)
+        losses = step_with_surface(model)[1]
+        assert float(losses["edge_loss"].detach()) == pytest.approx(depth * share, rel=1e-4)
+        assert float(losses["surface_loss"].detach()) == pytest.approx(surfaces * share**0.5, rel=1e-4)
 
 
 @pytest.mark.parametrize(("sharp", "scheduled"), [(0.0, False), (0.02, False), (0.02, True)])
@@ -205,7 +205,7 @@ def test_what_lidar_measured_keeps_its_weight(sharp, scheduled):
     weights = torch.where(measured[:, 0] & (sharp > 0), 0.5, 0.005)
     if scheduled:
         # as in a recorded step, which reads λ from the device
-        model.scheduled_weight = torch.tensor(0.005)
+        model.scheduled_weights = torch.tensor(0.005), torch.tensor(1.0)
         losses = losses_of(model, outputs, supervision)
     levels = [replace(each, sigma_m=supervision["prior_sigma_m"][:, 0]) for each in levels_of(outputs)]
     expected = sum((weights * EdgeLoss()(each)).sum() for each in levels) / 12 / 3

@@ -105,8 +105,8 @@ class RunAgain:
 def trainer_in(folder: Path, name: str, **changes: Any) -> EdgeDepthTrainer:
     """A training whose batches come as on a GPU, with as many rays at each step."""
     changes = {"max_num_iterations": STEPS, **changes}
-    # annealed beyond the eager steps
-    changes["model__proposal_weights_anneal_max_num_iters"] = 500.0
+    # what changes beyond the eager steps
+    changes |= {"model__proposal_weights_anneal_max_num_iters": 500.0, "model__surface_loss_final": 0.01}
     trainer = trainer_of(folder / "scene", folder / name, **changes)
     manager: Any = trainer.pipeline.datamanager
     model: Any = trainer.pipeline.model

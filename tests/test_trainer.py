@@ -103,7 +103,7 @@ def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trained
     whole = trainer.pipeline.model
     assert isinstance(whole, EdgeDepthNerfModel)
     assert whole.config.depth_loss_final == 0.01
-    assert whole.depth_weight() == pytest.approx(whole.config.depth_loss_mult * 0.01 ** ((STEPS - 1) / STEPS))
+    assert whole.weights_now()[0] == pytest.approx(whole.config.depth_loss_mult * 0.01 ** ((STEPS - 1) / STEPS))
     folder = trainer.checkpoint_dir
     longer = trainer_of(trainer.config.data, tmp_path / "longer", load_dir=folder, max_num_iterations=STEPS)
     assert writer.GLOBAL_BUFFER["max_iter"] == 2 * STEPS  # what steps are shown against
@@ -111,7 +111,7 @@ def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trained
     model = longer.pipeline.model
     assert isinstance(model, EdgeDepthNerfModel)
     share = 0.01 ** ((2 * STEPS - 1) / (2 * STEPS))
-    assert model.depth_weight() == pytest.approx(whole.config.depth_loss_mult * share)
+    assert model.weights_now()[0] == pytest.approx(whole.config.depth_loss_mult * share)
 
 
 def test_in_a_step_torch_has_one_thread_and_the_kernels_have_all(trainer, monkeypatch):

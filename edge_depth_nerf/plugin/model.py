@@ -107,6 +107,8 @@ class ModelOptions:
     surface_loss_mult: tyro.conf.Suppress[float] = 1.0
     """With a depth loss: weight of the colour error of the field at the prior's distance, for the datamanager's
     `surface_rays_per_batch` additional pixels, with one sample each."""
+    surface_loss_final: tyro.conf.Suppress[float] = 1.0
+    """The share of that weight that is left at the end of the training, as `depth_loss_final` is of λ."""
     exposure: Exposure = "gain"
     """Exposure and white balance. gain: a factor per colour and training picture. embedding: nerfacto's appearance
     embedding. none: not modelled."""
@@ -162,8 +164,8 @@ class EdgeDepthNerfModel(NerfactoModel):
         self._set_renderers()
         self.exposure, self.lpips, self.psnr = exposure, LpipsAtFirstUse(), Psnr()
         self._step, self._training_steps = 0, USUAL_STEPS
-        self.scheduled_weight: Tensor | None = None
-        """λ where it is a tensor, which can change without the host."""
+        self.scheduled_weights: tuple[Tensor, Tensor] | None = None
+        """`weights_now` where they are tensors, which can change without the host."""
         self.detail: TrainingDetail | None = None
         """Of the training pictures; the pipeline sets it."""
         self._view_rays, self.evaluation = ViewRays(), ViewEvaluation()
@@ -397,7 +399,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         else:
             losses = super().get_loss_dict(outputs, batch, metrics_dict)
         if self.training:
-            step = Step(outputs, batch, self.planes, self._share_done(), self.depth_weight())
+            step = Step(outputs, batch, self.planes, self._share_done(), *self.weights_now())
             left_out = () if "surface_rgb" in outputs else ("surface_loss",)
             losses |= {name: loss(step) for name, loss in self.step_losses.items() if name not in left_out}
         return losses
@@ -417,11 +419,13 @@ class EdgeDepthNerfModel(NerfactoModel):
         self.camera_optimizer.get_loss_dict(losses)
         return losses
 
-    def depth_weight(self) -> float | Tensor:
-        """λ at this step."""
-        if self.scheduled_weight is not None:
-            return self.scheduled_weight
-        return self.config.depth_loss_mult * self.config.depth_loss_final ** self._share_done()
+    def weights_now(self) -> tuple[float | Tensor, float | Tensor]:
+        """λ and the weight of surface pixels, at this step."""
+        if self.scheduled_weights is not None:
+            return self.scheduled_weights
+        config, done = self.config, self._share_done()
+        surface = config.surface_loss_mult * config.surface_loss_final**done
+        return config.depth_loss_mult * config.depth_loss_final**done, surface
 
     def _share_done(self) -> float:
         """The share of the training that is behind; of `USUAL_STEPS` if no trainer states them."""

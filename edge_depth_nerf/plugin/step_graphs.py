@@ -19,6 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import torch
@@ -107,17 +108,20 @@ class _Recorded:
 
 
 class Numbers:
-    """Numbers of a step where a graph reads them: λ, the exponent of annealed weights, and learning rates."""
+    """Numbers of a step where a graph reads them: weights of losses, the exponent of annealed ones, rates."""
 
     def __init__(self, count: int, device: torch.device | str) -> None:
         self.places = torch.zeros(count, device=device)
         self._held: list[float | None] = [None] * count
 
     def hold(self, numbers: Sequence[float]) -> None:
-        """Write those that have changed; a number goes with its kernel's launch, no copy has to be waited for."""
-        for place, (held, number) in enumerate(zip(self._held, numbers, strict=True)):
-            if held != number:
-                self.places[place].fill_(number)
+        """Write those that have changed, equal neighbours at once; a number goes with its kernel's launch."""
+        first = 0
+        for number, run in groupby(numbers):
+            behind = first + len([*run])
+            if any(held != number for held in self._held[first:behind]):
+                self.places[first:behind].fill_(number)
+            first = behind
         self._held = [*numbers]
 
 
@@ -160,7 +164,7 @@ class StepGraphs:
         self._optimizers = list(trainer.optimizers.optimizers.values())
         self._parameters = [each for group in trainer.optimizers.parameters.values() for each in group]
         self._groups = [group for optimizer in self._optimizers for group in optimizer.param_groups]
-        self._numbers = Numbers(2 + len(self._groups), trainer.device)
+        self._numbers = Numbers(3 + len(self._groups), trainer.device)
         self._noise = Noise(trainer.device)
         self._recorded: dict[bool, _Recorded] = {}
         self._taken: Counter[bool] = Counter()
@@ -216,7 +220,7 @@ class StepGraphs:
         """Give what differs between steps."""
         model = self._pipeline.model
         rates = [float(group["lr"]) for group in self._groups]
-        return [float(model.depth_weight()), float(model.proposal_sampler._anneal), *rates]
+        return [*map(float, model.weights_now()), float(model.proposal_sampler._anneal), *rates]
 
     def _step_schedulers(self, step: int) -> None:
         """Continue the learning rates, as nerfstudio's trainer does where the scale has not fallen."""
@@ -308,14 +312,14 @@ class StepGraphs:
         """Let model and optimisers read their numbers from the device, where they can change without the host."""
         model = self._pipeline.model
         sampler: Any = model.proposal_sampler
-        weight, anneal, *rates = self._numbers.places.unbind()
+        depth, surface, anneal, *rates = self._numbers.places.unbind()
         before = sampler._anneal, [(group["lr"], group["capturable"]) for group in self._groups]
-        model.scheduled_weight, sampler._anneal = weight, anneal
+        model.scheduled_weights, sampler._anneal = (depth, surface), anneal
         for group, rate in zip(self._groups, rates, strict=True):
             group["lr"], group["capturable"] = rate, True
         try:
             yield
         finally:
-            model.scheduled_weight, sampler._anneal = None, before[0]
+            model.scheduled_weights, sampler._anneal = None, before[0]
             for group, (rate, capturable) in zip(self._groups, before[1], strict=True):
                 group["lr"], group["capturable"] = rate, capturable

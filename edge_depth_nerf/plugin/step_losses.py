@@ -79,6 +79,8 @@ class Step:
     """The share of the training that is behind, 0 to 1."""
     depth_weight: float | Tensor
     """λ at this step."""
+    surface_weight: float | Tensor = 1.0
+    """That of surface pixels at this step."""
 
 
 StepLoss = Callable[[Step], Tensor]
@@ -136,22 +138,16 @@ class SkyLoss:
         return self.mult / len(every) * sky_loss(torch.cat([weights.squeeze(-1) for weights in every], dim=1), sky)
 
 
-@dataclass(frozen=True)
-class SurfaceLoss:
-    """The colour error of the field at the surfaces of surface pixels, mean over those that are of use."""
-
-    mult: float
-
-    def __call__(self, step: Step) -> Float[Tensor, ""]:
-        """Give the weighted loss."""
-        batch, image = step.batch, step.batch["surface_image"]
-        # no error of others; choosing pixels would make a GPU wait
-        counts = surface_counts(batch, step.planes)[:, None]
-        loss = torch.nn.functional.mse_loss(torch.where(counts, step.outputs["surface_rgb"], image), image)
-        if "surface_counts" not in batch:
-            return self.mult * loss
-        served = batch["surface_counts"][:, 0]
-        return self.mult * len(served) * loss / served.sum().clamp(min=1)
+def surface_loss(step: Step) -> Float[Tensor, ""]:
+    """Give the weighted colour error of the field at the surfaces of surface pixels, mean over those of use."""
+    batch, image, of_use = step.batch, step.batch["surface_image"], step.batch.get("surface_counts")
+    # a surface between the planes, or the sky
+    counts = batch["surface_sky"] | step.planes.hold(batch["surface_distance_m"])
+    counts = counts if of_use is None else counts & of_use
+    # no error of others; choosing pixels would make a GPU wait
+    error = torch.nn.functional.mse_loss(torch.where(counts, step.outputs["surface_rgb"], image), image)
+    loss = step.surface_weight * error
+    return loss if of_use is None else loss / of_use.mean(dtype=torch.float32).clamp(min=1 / len(of_use))
 
 
 def step_losses_of(config: Any) -> dict[str, StepLoss]:
@@ -178,14 +174,8 @@ def step_losses_of(config: Any) -> dict[str, StepLoss]:
     if config.sky_loss_mult > 0:
         losses["sky_loss"] = SkyLoss(config.sky_loss_mult)
     if config.surface_loss_mult > 0:
-        losses["surface_loss"] = SurfaceLoss(config.surface_loss_mult)
+        losses["surface_loss"] = surface_loss
     return losses
-
-
-def surface_counts(batch: Mapping[str, Any], planes: Planes) -> Bool[Tensor, "pixels"]:
-    """Which surface pixels have a surface between the planes, or are sky, and are of use."""
-    counts = batch["surface_sky"][:, 0] | planes.hold(batch["surface_distance_m"][:, 0])
-    return counts & batch["surface_counts"][:, 0] if "surface_counts" in batch else counts
 
 
 def draw_surface_m(batch: Mapping[str, Any], planes: Planes) -> Float[Tensor, "pixels"]:
