@@ -16,7 +16,7 @@ from edge_depth_nerf.plugin.exposure import Gains
 pytestmark = pytest.mark.slow
 
 MOST = {
-    "full, a view": (174, 11.8),
+    "full, a view": (159, 10.9),
     "full": (301, 2.4),
     "full, proposals rest": (247, 1.8),
     "full, poses": (752, 2.7),

@@ -16,7 +16,7 @@ from edge_depth_nerf.method.depth_losses import DsNerfLoss, EdgeLoss, Level, Urb
 from edge_depth_nerf.method.losses import edge_loss, urban_nerf_loss
 from edge_depth_nerf.plugin.compat import lpips_not_built
 from edge_depth_nerf.plugin.model import LossOptions
-from edge_depth_nerf.plugin.renderers import DepthInEvaluation
+from edge_depth_nerf.plugin.renderers import MedianDepth
 from edge_depth_nerf.plugin.step_losses import Planes, Step, draw_surface_m
 
 METRES_PER_UNIT = 20.0
@@ -366,7 +366,7 @@ def test_distance_is_that_of_what_a_ray_hits():
         frustums=Frustums(origins=zero, directions=zero, starts=starts, ends=starts + 1, pixel_area=starts)
     )
     weights = torch.tensor([[0.0, 0.3, 0.0, 0.0], [0.0, 0.0, 0.8, 0.2], [0.01, 0.0, 0.0, 0.0]])[..., None]
-    renderer = DepthInEvaluation(method="median").eval()
+    renderer = MedianDepth().eval()
     assert renderer(weights, samples)[:, 0].tolist() == [1.5, 2.5, 3.5]
 
 

@@ -26,7 +26,7 @@ def termination_std(
     stopped = weights.sum(-1, keepdim=True)
     share = torch.where(stopped > SMALLEST_WEIGHT, weights, lengths)
     share = share / share.sum(-1, keepdim=True)
-    midpoints = (starts + ends) / 2
+    midpoints = torch.lerp(starts, ends, 0.5)
     mean = (share * midpoints).sum(-1, keepdim=True)
     # about the mean: float32 has no digits left after subtracting the squares of a kilometre
-    return (share * ((midpoints - mean).square() + lengths.square() / 12)).sum(-1).sqrt()
+    return (share * torch.addcmul((midpoints - mean).square(), lengths, lengths, value=1 / 12)).sum(-1).sqrt()

@@ -49,8 +49,8 @@ from edge_depth_nerf.plugin.pose_refinement import (
 from edge_depth_nerf.plugin.ray_table import ViewRays
 from edge_depth_nerf.plugin.renderers import (
     INFINITELY_FAR,
-    DepthInEvaluation,
     DepthMoments,
+    MedianDepth,
     NoBackground,
     background_of,
     depths,
@@ -213,7 +213,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         """Set nerfacto's renderers and planes to ours."""
         if self._has_sky:
             self.renderer_rgb = NoBackground()
-        self.renderer_depth = DepthInEvaluation(method="median")
+        self.renderer_depth = MedianDepth()
         self.renderer_expected_depth = DepthMoments()
         # the near plane is not reset at evaluation: nothing was trained in front of it
         near, far = (distance_m / self.metres_per_unit for distance_m in (self.config.near_m, self.config.far_m))
@@ -444,8 +444,7 @@ class EdgeDepthNerfModel(NerfactoModel):
             truth, where there are any, are in `evaluation.pooled`: a view without them has no figure of its own.
         """
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
-        lpips = self.lpips.load(self.device)
-        if lpips is None:
+        if (lpips := self.lpips.load(self.device)) is None:
             del metrics["lpips"]
         distance_m = outputs["depth"][..., 0] * self.metres_per_unit
         metrics |= self.evaluation.of_view(outputs["rgb"].clamp(0, 1), distance_m, batch, lpips)

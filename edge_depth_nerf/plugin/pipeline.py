@@ -228,18 +228,11 @@ class EdgeDepthPipeline(VanillaPipeline):
         metrics, images = super().get_eval_image_metrics_and_images(step)
         return {**metrics, **model.evaluation.pooled()}, images
 
-    def get_average_image_metrics(
-        self,
-        data_loader: Any,
-        image_prefix: str,
-        step: int | None = None,
-        output_path: Path | None = None,
-        get_std: bool = False,
-    ) -> dict[str, Any]:
+    def get_average_image_metrics(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Average figures over pictures as nerfstudio does, but AbsRel, RMSE and δ over all their pixels together."""
         model: Any = self.model
         model.evaluation.reset()
-        metrics = super().get_average_image_metrics(data_loader, image_prefix, step, output_path, get_std)
+        metrics = super().get_average_image_metrics(*args, **kwargs)
         pooled = model.evaluation.pooled()
         # a spread over pictures says nothing of a pooled figure, and of a single picture it is NaN
         spreads = {f"{name}_std" for name in pooled}

@@ -47,8 +47,8 @@ class NoBackground(RGBRenderer):
         return super().forward(rgb, weights, *args, **{**kwargs, "background_color": background})  # pyrefly: ignore
 
 
-class DepthInEvaluation(DepthRenderer):
-    """nerfstudio's depth, of that share of a ray that hits something; nothing in training, where nobody reads it.
+class MedianDepth(DepthRenderer):
+    """nerfstudio's median depth, of that share of a ray that hits something; in training nothing, as nobody reads it.
 
     At an outline a pixel is half sky, half house: the house's distance is its distance.
     """
@@ -57,9 +57,13 @@ class DepthInEvaluation(DepthRenderer):
         """Give the depth, [rays, 1]; in training None."""
         if self.training:
             return None
-        hit = weights.sum(dim=-2, keepdim=True)
-        weights = torch.where(hit > LEAST_HIT, weights / hit.clamp(min=LEAST_HIT), weights)
-        return super().forward(weights, ray_samples, *args, **kwargs)
+        stopped = torch.cumsum(weights[..., 0], dim=-1)
+        hit = stopped[..., -1:]
+        half = (hit / 2).masked_fill(hit <= LEAST_HIT, 0.5)
+        sample = torch.searchsorted(stopped, half).clamp(max=stopped.shape[-1] - 1)
+        at = ray_samples.frustums
+        starts, ends = (edges[..., 0].gather(-1, sample) for edges in (at.starts, at.ends))
+        return torch.lerp(starts, ends, 0.5)
 
 
 class DepthMoments(DepthRenderer):
