@@ -20,7 +20,6 @@ FORMS: tuple[Form, ...] = ("bag", "db3", "mcap")
 FIRST_NS = 1_700_000_000_123_456_789
 """The stamps' own clock; messages are recorded some milliseconds later."""
 LATE_NS = 7_000_000
-OPTICAL = Rotation.from_matrix(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], float))
 KINDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
 

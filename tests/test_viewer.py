@@ -525,6 +525,22 @@ def test_the_buttons_of_a_training_are_those_of_its_state(training):
     viewer.pause_train.visible = True
 
 
+def test_a_browser_that_leaves_stops_neither_the_training_nor_other_browsers(training, monkeypatch):
+    viewer, server, moves = training.viewer, training.viewer.viser_server, []
+    camera = SimpleNamespace(on_update=moves.append, wxyz=(1, 0, 0, 0), position=(0, 0, 0), fov=1.0, aspect=1.0)
+    client: Any = SimpleNamespace(client_id=77, camera=camera)
+    monkeypatch.setattr(RenderStateMachine, "start", lambda _: None)
+    viewer.handle_new_client(client)
+    viewer.handle_disconnect(client)
+    moves[0](camera)  # begun before it left, as are a film's preview and a step of the training
+    until(lambda: not server._websock_server._atomic_lock.locked())
+    monkeypatch.setattr(server, "get_clients", lambda: {77: client})
+    viewer._trigger_rerender()
+    # the training asks, too, and goes on
+    announced = viewer.last_step
+    until(lambda: viewer.last_step > announced and training.trainer.step > viewer.last_step)
+
+
 def test_a_file_that_went_away_is_said_and_the_switch_goes_back(training, capsys, monkeypatch):
     def broken(_):
         raise InputError("lidar/7.png: cannot be decoded. Make it again.")
@@ -543,20 +559,10 @@ def test_a_file_that_went_away_is_said_and_the_switch_goes_back(training, capsys
 
 # ---- in a browser ----------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
-def interruptible() -> Iterator[None]:
-    """Renderings that may be interrupted: types are not checked.
-
-    Nerfstudio ends a rendering by an exception in whatever line it is at. In the tests' type checker, that would be
-    taken for a wrong type, and the browser would get no picture any more.
-    """
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
-
-
-@pytest.fixture(scope="module")
-def page(browser, training, interruptible):
+def page(browser, training):
     """The viewer in a browser without a network, looking at the drive from above; the training waits."""
+    # nerfstudio ends a rendering by an exception in any line, which a checker would take for a wrong type
+    jaxtyping.config.update("jaxtyping_disable", True)
     server = training.viewer.viser_server
     here = f"http://127.0.0.1:{server.get_port()}"
     page = browser.new_page(viewport={"width": 900, "height": 620})
@@ -569,6 +575,7 @@ def page(browser, training, interruptible):
     look_from_above(training)
     yield page
     training.trainer.training_state = "training"
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def look_from_above(training) -> None:
@@ -602,7 +609,6 @@ def changed(one: np.ndarray, other: np.ndarray) -> int:
     return int((np.abs(one - other).max(-1) > 40).sum())
 
 
-@pytest.mark.slow
 def test_the_page_shows_the_scene(page, training):
     picture = settled(page)
     assert picture.std(axis=(0, 1)).max() > 5  # not blank
@@ -611,7 +617,6 @@ def test_the_page_shows_the_scene(page, training):
     until(lambda: "distance_coloured" in training.viewer.control_panel._output_render.options)
 
 
-@pytest.mark.slow
 def test_a_browser_begins_at_a_training_camera(browser, page, training):
     server = training.viewer.viser_server
     known = set(server.get_clients())
@@ -633,7 +638,6 @@ def test_a_browser_begins_at_a_training_camera(browser, page, training):
     other.close()
 
 
-@pytest.mark.slow
 def test_a_switch_works(page, training):
     layer = "lidar"
     box = page.get_by_label("LiDAR points")
@@ -653,7 +657,6 @@ def test_a_switch_works(page, training):
     turn(begun, lambda picture: changed(before, picture) < changed(before, other) / 3)
 
 
-@pytest.mark.slow
 def test_outputs_and_the_fisheye_preview(page, training):
     def saturation(picture: np.ndarray) -> float:
         return float((picture.max(-1) - picture.min(-1)).mean())

@@ -10,14 +10,17 @@ from __future__ import annotations
 import inspect
 import os
 import warnings
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras
     from nerfstudio.engine.trainer import Trainer
+    from nerfstudio.viewer.viewer import Viewer
 
 
 def allow_numpy_scalars_in_checkpoints() -> None:
@@ -125,6 +128,21 @@ def know_modules_of_importer() -> None:
         inspect.modulesbyfile.setdefault(os.path.normcase(os.path.abspath(f"<frozen {name}>")), name)
 
 
+def outlive_leaving_browsers(viewer: Viewer) -> None:
+    """Let what asks for the renderer of a browser that has left get one that does nothing, instead of a KeyError.
+
+    A training asks at its steps, and would end. A camera's movement asks within viser's `atomic`, which would keep its
+    lock: no browser would get anything more.
+
+    No issue reports it; this is what brought it.
+
+    Works around: https://github.com/nerfstudio-project/nerfstudio/pull/2519.
+    Ends with: a nerfstudio that looks whether a browser is still there.
+    """
+    nothing: Any = SimpleNamespace(action=lambda _: None)
+    viewer.render_statemachines = defaultdict(lambda: nothing, viewer.render_statemachines)
+
+
 def total_steps(trainer: Trainer) -> int:
     """Count all steps of a training, also those before it was resumed; `max_num_iterations` are those to come.
 
@@ -132,18 +150,6 @@ def total_steps(trainer: Trainer) -> int:
     Ends with: a nerfstudio that has its pull request 3526, where `max_num_iterations` are all steps.
     """
     return trainer._start_step + trainer.config.max_num_iterations
-
-
-def count_steps_against_all(trainer: Trainer) -> None:
-    """Let nerfstudio's printed progress of a resumed training end at 100 %.
-
-    Works around: https://github.com/nerfstudio-project/nerfstudio/issues/1304.
-    Ends with: a nerfstudio that has its pull request 3526.
-    """
-    from nerfstudio.utils import writer
-
-    if "max_iter" in writer.GLOBAL_BUFFER:
-        writer.GLOBAL_BUFFER["max_iter"] = total_steps(trainer)
 
 
 def join_lines_of_option_help() -> None:

@@ -73,8 +73,6 @@ from edge_depth_nerf.scene.format import LAYERS, depth_sources
 
 KEPT_TABLES = 8
 """This many tables of pixels are kept per scene, the last used ones. 300 pictures of 1400×1400 px take 6 GB."""
-
-
 SHORT_NAMES = {"lidar": "LiDAR", "mono": "monocular"}
 """Of sources of the prior, in a line."""
 SURFACE_SIGMA_M = 0.1

@@ -31,7 +31,7 @@ from edge_depth_nerf.base.interrupts import ctrl_c_put_off
 from edge_depth_nerf.jobs.runs import checkpoints_in, commands_after, newest_checkpoint
 from edge_depth_nerf.kernels.table_adam import TableAdam
 from edge_depth_nerf.kernels.threads import torch_on_one_thread
-from edge_depth_nerf.plugin.compat import count_steps_against_all, ignore_deprecations_of_host, total_steps
+from edge_depth_nerf.plugin.compat import ignore_deprecations_of_host, total_steps
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, transforms_path
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
@@ -116,7 +116,6 @@ class EdgeDepthTrainer(Trainer):
             )
         try:
             super().setup(test_mode)
-            count_steps_against_all(self)
             if self.config.cuda_graphs and test_mode != "inference" and torch.device(self.device).type == "cuda":
                 self._use_graphs(GpuCapture(self.device))
         except KeyboardInterrupt:

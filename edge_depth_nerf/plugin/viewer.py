@@ -35,6 +35,7 @@ from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.base.pictures import DISTANCE, SIGMA
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.plugin.coarse_to_fine import render_coarse_to_fine
+from edge_depth_nerf.plugin.compat import outlive_leaving_browsers
 from edge_depth_nerf.plugin.evaluation import evaluated
 from edge_depth_nerf.plugin.scanning import Caster, SceneToModel, some_of
 from edge_depth_nerf.scene.sweeps import SCANNERS, scanners_of
@@ -221,6 +222,7 @@ class DriveLayers(ViewerControl):
     def _setup(self, viewer: Viewer) -> None:
         """Install the panel, and draw the layers that are on at the start."""
         super()._setup(viewer)
+        outlive_leaving_browsers(viewer)
         gui = viewer.viser_server.gui
         # above the panel's tabs, where they are visible at once
         with gui.add_folder(FOLDER, order=viewer.stats_markdown.order + 0.5):
