@@ -19,7 +19,7 @@ MOST = {
     "full, a view": (159, 10.9),
     "full": (301, 2.4),
     "full, proposals rest": (247, 1.8),
-    "full, poses": (752, 2.7),
+    "full, poses": (667, 2.6),
     "lite": (273, 0.9),
     "paper": (243, 2.3),
 }

@@ -76,7 +76,8 @@ class PoseRefiner(CameraOptimizer):
             assert raybundle.camera_indices is not None
             correction = self(raybundle.camera_indices[:, 0])
             raybundle.origins = raybundle.origins + correction[:, :3, 3]
-            raybundle.directions = (correction[:, :3, :3] @ raybundle.directions[..., None])[..., 0]
+            # a product of matrices would be one of half precision
+            raybundle.directions = (correction[:, :3, :3] * raybundle.directions[:, None]).sum(-1)
 
     def get_loss_dict(self, loss_dict: dict[str, Any]) -> None:
         """Add what the adjustments cost."""
