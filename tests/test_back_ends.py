@@ -27,6 +27,7 @@ from edge_depth_nerf.kernels.functions import (
     SAMPLE_PDF,
     WEIGHTS,
 )
+from edge_depth_nerf.kernels.triton_launch import launch
 from edge_depth_nerf.method.losses import EDGE_LOSS, step_kernels
 from edge_depth_nerf.plugin.step_losses import distortion_loss
 
@@ -201,6 +202,25 @@ def test_a_rendering_may_be_the_first_that_needs_a_kernel(mode):
         finally:
             sys.settrace(before)
     assert tried_out(form, CPU) is right.load() and asked == [CPU]
+
+
+def test_no_picture_ends_within_the_compilation_of_a_kernel():
+    seen = []
+
+    def traced(*_: Any) -> Any:
+        return traced
+
+    def run(*_: Any, **__: Any) -> None:
+        seen.append(sys.gettrace())
+
+    before = sys.gettrace()
+    sys.settrace(traced)
+    try:
+        launch({(1,): run}, (1,), torch.zeros(1))
+        seen.append(sys.gettrace())
+    finally:
+        sys.settrace(before)
+    assert seen == [None, traced]
 
 
 def test_nothing_is_tried_while_a_cuda_graph_is_recorded(monkeypatch):

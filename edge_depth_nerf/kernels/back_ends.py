@@ -6,7 +6,6 @@ first use of a kernel on a device compares it with its formula in torch.
 
 from __future__ import annotations
 
-import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -17,6 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from edge_depth_nerf.kernels.triton_launch import untraced
+
 Example = dict[str, Any]
 """Arguments of a function by their names; tensors that require a gradient get one."""
 
@@ -25,17 +26,11 @@ Example = dict[str, Any]
 def undisturbed() -> Iterator[None]:
     """Enable gradients, taken in this thread, and stop tracing, to try out kernels.
 
-    The first caller may be a rendering. It has no gradients, which a trial needs. In the viewer's thread nerfstudio
-    also traces each line of Python, and ends a picture by an error there. It would look like an error of the kernel.
-    Otherwise one thread of torch would compile the gradients of all kernels that are tried out side by side.
+    The first caller may be a rendering. It has no gradients, which a trial needs. Otherwise one thread of torch would
+    compile the gradients of all kernels that are tried out side by side.
     """
-    trace = sys.gettrace()
-    sys.settrace(None)
-    try:
-        with torch.inference_mode(False), torch.enable_grad(), torch.autograd.set_multithreading_enabled(False):
-            yield
-    finally:
-        sys.settrace(trace)
+    with untraced(), torch.inference_mode(False), torch.enable_grad(), torch.autograd.set_multithreading_enabled(False):
+        yield
 
 
 def _nothing() -> None:

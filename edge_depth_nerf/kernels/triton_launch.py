@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+
+@contextmanager
+def untraced() -> Iterator[None]:
+    """Stop tracing: nerfstudio ends a picture of its viewer by an error in any line, also of Triton's compiler."""
+    trace = sys.gettrace()
+    sys.settrace(None)
+    try:
+        yield
+    finally:
+        sys.settrace(trace)
 
 
 def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **constants: Any) -> None:
@@ -16,7 +30,7 @@ def launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **constants: Any
     `constants` are what the kernel is compiled for, and options of the compiler.
     """
     if 0 not in grid:
-        with torch.cuda.device_of(arguments[0]):
+        with torch.cuda.device_of(arguments[0]), untraced():
             kernel[grid](*arguments, **constants, enable_fp_fusion=False)
 
 

@@ -126,7 +126,8 @@ class CoarseToFine(RenderStateMachine):
             with detail_shown(with_detail):
                 outputs = super()._render_img(camera_state)
             if outputs["rgb"].is_cuda:
-                torch.cuda.synchronize(outputs["rgb"].device)  # until here it was only asked for
+                # until here it was only asked for; waiting for all streams would spoil a recording
+                torch.cuda.current_stream(outputs["rgb"].device).synchronize()
         finally:
             self._is_rendering = False
         rays = outputs["rgb"].shape[0] * outputs["rgb"].shape[1]
