@@ -299,11 +299,38 @@ class Generator:
 
 def test_after_a_failure_the_generator_draws_again_what_it_would_have_drawn(monkeypatch):
     generator = Generator(records=True)
-    capture = object.__new__(GpuCapture)
-    capture._device, capture._random_state = torch.device("cuda:0"), torch.tensor([7])
+    capture: Any = object.__new__(GpuCapture)
+    capture._device, capture._random_state, capture._pool = torch.device("cuda:0"), torch.tensor([7]), (0, 1)
     monkeypatch.setattr(torch.cuda, "default_generators", (generator,))
+    monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 2))
     capture.recover()
     assert not generator.state.records and generator.state.value == 7
+    assert capture._pool == (0, 2)  # to the one before torch still records
+
+
+def test_a_recording_that_cannot_be_ended_leaves_the_stream_that_was(monkeypatch):
+    """As in torch up to 2.11, whose way out ends with the error of the recording's end."""
+    streams = ["the usual"]
+
+    @contextlib.contextmanager
+    def graph(*_: Any, stream: str, **__: Any) -> Iterator[None]:
+        streams.append(stream)
+        yield
+        raise RuntimeError("operation failed due to a previous error during capture")
+
+    capture: Any = object.__new__(GpuCapture)
+    capture._device, capture._stream, capture._pool = torch.device("cuda:0"), "of recordings", (0, 1)
+    for name, stand_in in (
+        ("get_rng_state", lambda _: torch.zeros(1)),
+        ("CUDAGraph", SimpleNamespace),
+        ("graph", graph),
+        ("current_stream", lambda _: streams[-1]),
+        ("set_stream", streams.append),
+    ):
+        monkeypatch.setattr(torch.cuda, name, stand_in)
+    with pytest.raises(RuntimeError, match="previous error"):
+        capture.record(lambda: None)
+    assert streams == ["the usual", "of recordings", "the usual"]
 
 
 def test_where_it_is_not_possible_training_says_so(folder, capsys, monkeypatch):
@@ -319,6 +346,8 @@ def test_where_it_is_not_possible_training_says_so(folder, capsys, monkeypatch):
         (model, "fused", False, "implementation torch"),
         (model.config, "depth_loss", "urban-nerf-los", "changes at each step"),
         (model.config, "predict_normals", True, "normals are trained"),
+        (trainer.optimizers.optimizers["fields"], "param_groups", [{"fused": None}], "an optimiser is not fused"),
+        (step_graphs, "TableRayGenerator", str, "its cameras have no table of rays"),  # so that ours is another
     ):
         with monkeypatch.context() as changed:
             changed.setattr(holder, name, value)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import copy
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
@@ -29,6 +29,7 @@ from torch import Tensor
 
 from edge_depth_nerf.plugin.fused.noise import Noise
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
+from edge_depth_nerf.plugin.ray_table import TableRayGenerator
 from edge_depth_nerf.plugin.step_losses import PriorLoss
 
 if TYPE_CHECKING:
@@ -80,21 +81,29 @@ class GpuCapture:
     def record(self, work: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
         """Record a function."""
         self._random_state = torch.cuda.get_rng_state(self._device)
-        graph = torch.cuda.CUDAGraph()
-        # the viewer's thread may use the GPU meanwhile, on its own stream
-        with torch.cuda.graph(graph, pool=self._pool, stream=self._stream, capture_error_mode="thread_local"):
-            found = work()
+        graph, before = torch.cuda.CUDAGraph(), torch.cuda.current_stream(self._device)
+        try:
+            # the viewer's thread may use the GPU meanwhile, on its own stream
+            with torch.cuda.graph(graph, pool=self._pool, stream=self._stream, capture_error_mode="thread_local"):
+                found = work()
+        finally:
+            # a recording that cannot be ended stays on its stream
+            torch.cuda.set_stream(before)
         return found, graph.replay
 
     def recover(self) -> None:
-        """Give the generator a state that does not record.
+        """Give the generator a state that does not record, and the next recording memory of its own.
 
-        A recording that was cut short leaves it in one that refuses to draw.
+        A recording that was cut short leaves the one in a state that refuses to draw, and the other where torch still
+        records to it.
         """
         index = torch.cuda.current_device() if self._device.index is None else self._device.index
         generator = torch.cuda.default_generators[index]
         generator.graphsafe_set_state(generator.clone_state())
         generator.set_state(self._random_state)
+        with suppress(AttributeError, RuntimeError):  # torch 2.6 has no such function; later ones may have ended it
+            torch._C._cuda_endAllocateToPool(index, self._pool)
+        self._pool = torch.cuda.graph_pool_handle()
 
 
 @dataclass(frozen=True)
@@ -146,6 +155,10 @@ def why_not(trainer: Trainer) -> str | None:
         return f"the loss {model.config.depth_loss} changes at each step"
     if model.config.predict_normals:
         return "normals are trained"
+    if not all(group.get("fused") for each in trainer.optimizers.optimizers.values() for group in each.param_groups):
+        return "an optimiser is not fused"
+    if not isinstance(pipeline.datamanager.train_ray_generator, TableRayGenerator):
+        return "its cameras have no table of rays: many large lenses, or neither fisheye nor perspective"
     return None
 
 
