@@ -75,9 +75,16 @@ def check_torch() -> Iterator[Finding]:
         return
     yield Finding("PyTorch", "ok", torch.__version__)
     if torch.cuda.is_available():
-        free, total = (size / 2**30 for size in torch.cuda.mem_get_info())
-        versions = f"driver {_driver()}, CUDA {torch.version.cuda}, Triton {_version_of('triton')}"
         name = torch.cuda.get_device_name()
+        versions = f"driver {_driver()}, CUDA {torch.version.cuda}, Triton {_version_of('triton')}"
+        try:
+            torch.ones(1, device="cuda").sum().item()
+            free, total = (size / 2**30 for size in torch.cuda.mem_get_info())
+        except Exception as error:  # no code for this card, no memory for a context, a card that is used alone
+            found = f"{name}, on which torch cannot compute ({_first_line(error)}); {versions}"
+            remedy = "Install a torch for this GPU (https://pytorch.org/get-started), or end what has its memory."
+            yield Finding("Device", "problem", found, remedy)
+            return
         yield Finding("Device", "ok", f"{name}, {total:.0f} GiB, of which {free:.0f} are free; {versions}")
         return
     built = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
@@ -117,8 +124,9 @@ def check_gpu() -> Iterator[Finding]:
             failures.append(f"{form.name} ({_first_line(error)})")
     right = f"{len(forms) - len(failures)} of {len(forms)} give the numbers of their formulas in torch"
     remedy = (
-        "A training computes these in torch, with the same results but slower. Triton needs a C compiler (apt-get "
-        "install gcc), and the version that came with this torch (pip install --force-reinstall torch)."
+        "A training computes these in torch, with the same results but slower. Triton needs a C compiler and Python's "
+        "headers (apt-get install gcc python3-dev), a folder to write to (TRITON_CACHE_DIR), and the version that came "
+        "with this torch (pip install --force-reinstall torch)."
     )
     yield _finding("GPU kernels", not failures, "; ".join([right, *failures]), remedy, "note")
     try:
@@ -293,12 +301,14 @@ def _first_line(error: Exception) -> str:
 
 
 def _gpu() -> torch.device | None:
-    """The GPU that torch takes; None without."""
+    """The GPU that torch takes; None without, or where it cannot compute."""
     try:
         import torch
+
+        torch.ones(1, device="cuda").sum().item()
     except Exception:  # which another check reports
         return None
-    return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else None
+    return torch.device("cuda", torch.cuda.current_device())
 
 
 def _driver() -> str:

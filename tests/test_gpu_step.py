@@ -11,6 +11,7 @@ from benchmark_modules import benchmark_modules
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from edge_depth_nerf.method.depth_losses import LOSSES, Level, depth_loss
+from edge_depth_nerf.method.losses import step_kernels
 from edge_depth_nerf.plugin.exposure import Gains
 
 pytestmark = pytest.mark.slow
@@ -24,6 +25,7 @@ MOST = {
     "paper": (243, 2.3),
 }
 """Today's kernels, and gigabytes of torch's operations: to be lowered when fewer are needed, never raised."""
+FORMS = {form.name: form for form in step_kernels()}
 
 
 @pytest.fixture(scope="module")
@@ -102,15 +104,17 @@ def test_the_counter_counts(gpu_counts):
             torch.add(x, torch.ones(5))
 
 
-@pytest.mark.parametrize("what", ["gains of colours", "ds-nerf", "urban-nerf", "urban-nerf-los"])
+@pytest.mark.parametrize("what", ["gains of colours", "ds-nerf", "urban-nerf", "urban-nerf-los", *FORMS])
 def test_an_operation_alone_copies_nothing_from_the_host(what, gpu_counts):
     counter = gpu_counts.Counter()
     with FakeTensorMode(), torch.device("cuda"):
         gains, colours, picture = Gains(3), torch.rand(7, 3), torch.zeros(7).long()
+        examples = FORMS[what].in_a_step(torch.device("cuda")) if what in FORMS else []
         level = Level(torch.rand(7, 5), torch.rand(7, 5), torch.rand(7, 5), torch.rand(7), torch.rand(7))
         with counter:
-            found = depth_loss(LOSSES[what](), [level]) if what in LOSSES else gains(colours, picture)
-            found.sum()
+            for each in examples:
+                FORMS[what].formula(**each)
+            (depth_loss(LOSSES[what](), [level]) if what in LOSSES else gains(colours, picture)).sum()
     assert counter.counts.parts["other"].kernels > 0 and not counter.counts.synchronisations
 
 

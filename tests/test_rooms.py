@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "edge_depth_nerf"
 
 MOST_LINES = {
-    "edge_depth_nerf": 675,
+    "edge_depth_nerf": 685,
     "edge_depth_nerf/base": 1_575,
     "edge_depth_nerf/cameras": 1_325,
     "edge_depth_nerf/compare": 2_870,
@@ -21,7 +21,7 @@ MOST_LINES = {
     "edge_depth_nerf/films": 1_785,
     "edge_depth_nerf/inspecting": 1_385,
     "edge_depth_nerf/jobs": 780,
-    "edge_depth_nerf/kernels": 3_740,
+    "edge_depth_nerf/kernels": 3_745,
     "edge_depth_nerf/lidar": 1_750,
     "edge_depth_nerf/masks": 1_185,
     "edge_depth_nerf/method": 3_135,
@@ -38,11 +38,11 @@ MOST_LINES = {
     "edge_depth_nerf/scene": 2_100,
     "edge_depth_nerf/stereo": 900,
     "edge_depth_nerf/synthetic": 3_455,
-    "tests": 35_464,
+    "tests": 35_483,
     "benchmarks": 140,
     "benchmarks/quality": 1_250,
     "benchmarks/robustness": 680,
-    "benchmarks/speed": 1_990,
+    "benchmarks/speed": 1_995,
 }
 """Lines of Python that the modules of each folder may have together, without those of its subfolders."""
 

@@ -75,7 +75,7 @@ class InAProcess:
     """A part in a process that is ended with all that it started when its limit is over, or this process ends."""
 
     def __init__(self, name: str, options: argparse.Namespace) -> None:
-        self.limit_s, self.path = PARTS[name].limit_s, file_of(options.output, name)
+        self.limit_s, self.path = options.patience * PARTS[name].limit_s, file_of(options.output, name)
         self.path.unlink(missing_ok=True)
         caches = settings_of(options).caches
         environment = {variable: str((caches / folder).absolute()) for variable, folder in CACHES.items()}
@@ -100,7 +100,7 @@ class InAProcess:
             status = self._process.wait(max(0.0, self._began + self.limit_s - time.time()))
             failed = f"status {status}; {self.path.stem}.log says more"
         except subprocess.TimeoutExpired:
-            failed = f"not done after {self.limit_s} s"
+            failed = f"not done after {self.limit_s:g} s (--patience 3 gives it three times as long)"
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -230,11 +230,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--parts", nargs="+", default=list(PARTS), choices=list(PARTS), metavar="NAME")
     parser.add_argument("--again", action="store_true", help="also what was done before")
     parser.add_argument("--fake", action="store_true", help="tiny sizes on the CPU")
+    parser.add_argument("--patience", type=float, default=1, help="times the limits, which are an H200's")
     parser.add_argument("--only", choices=list(PARTS), help=argparse.SUPPRESS)
     parser.add_argument("--began", type=float, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.only:
-        end_with_parent()
+        end_with_parent(lambda: os.killpg(0, signal.SIGKILL))
         path = file_of(options.output, options.only)
         write(path, here(options.only, dataclasses.replace(settings_of(options), began=options.began), path))
         return 0

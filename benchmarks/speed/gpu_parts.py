@@ -488,8 +488,10 @@ def gpu_tests(settings: Settings) -> Found:
     command += [] if settings.fake else ["-k", "on_a_gpu"]
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     last = done.stdout.strip().rpartition("\n")[2]
-    counted = {what: int(number) for number, what in re.findall(r"(\d+) (passed|failed|skipped|error)", last)}
-    return {**counted, **({"said": done.stdout[-4000:]} if done.returncode else {})}
+    counted: Found = {what: int(number) for number, what in re.findall(r"(\d+) (passed|failed|skipped|error)", last)}
+    if done.returncode:
+        counted |= {"failed": f"pytest ended with status {done.returncode}", "said": done.stdout[-4000:]}
+    return counted
 
 
 def counts(settings: Settings) -> Found:

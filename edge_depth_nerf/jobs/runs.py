@@ -91,17 +91,17 @@ class LoggedCommands:
                 self._process.kill()
 
 
-def end_with_parent() -> None:
+def end_with_parent(end: Callable[[], object] = lambda: os._exit(1)) -> None:
     """Let a program that `LoggedCommands` started die when the process that did so is gone, killed or not.
 
-    That process's end of our standard input closes then.
+    That process's end of our standard input closes then, and `end` is called.
     """
 
     def wait() -> None:
         # not sys.stdin: Python would wait for its lock when it ends
         while os.read(0, 1024):
             pass
-        os._exit(1)
+        end()
 
     Thread(target=wait, daemon=True).start()
 

@@ -118,10 +118,10 @@ def _outcome(
             return type(value)(map(given, value))
         if not isinstance(value, Tensor) or not value.is_floating_point():
             return value
-        # where no gradient is asked for a view stays a view
+        # a view stays a view
         made = value if dtype is None else value.to(dtype)
         if value.requires_grad:
-            made = made.detach().clone().requires_grad_()
+            made = made.detach().requires_grad_()
             leaves.append(made)
         return made
 
@@ -174,7 +174,7 @@ def _try_out(form: GpuForm, device: torch.device, passed: Callable[[], None]) ->
         failure = f"{type(error).__name__}: {error}"
     warnings.warn(
         f"The fused {form.name} does not work on {device} ({failure}); torch's form takes its place, with the same "
-        "results but slower.",
+        "results but slower (`edge-depth-nerf doctor` says more).",
         stacklevel=2,
     )
     return None

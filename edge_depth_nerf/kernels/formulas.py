@@ -130,12 +130,12 @@ def hash_grid(
     levels, rows = len(scalings), len(table) // len(scalings)
     scaled = positions[:, None] * scalings[:, None]
     low = scaled.floor()
-    primes = torch.tensor([1, 2654435761, 805459861], device=positions.device)
-    hashed, place = [each.long() * primes for each in (low, scaled.ceil())], scaled - low
+    primes, place = (1, 2654435761, 805459861), scaled - low
+    hashed = [[each[..., axis].long() * primes[axis] for axis in range(3)] for each in (low, scaled.ceil())]
     first = rows * torch.arange(levels, device=positions.device)
     encoded = torch.zeros_like(scaled[..., :1])
     for corner in itertools.product((0, 1), repeat=3):
-        x, y, z = (hashed[upper][..., axis] for axis, upper in enumerate(corner))
+        x, y, z = (hashed[upper][axis] for axis, upper in enumerate(corner))
         shares = [place[..., axis] if upper else 1 - place[..., axis] for axis, upper in enumerate(corner)]
         encoded = encoded + math.prod(shares)[..., None] * table[first + (x ^ y ^ z) % rows]  # pyrefly: ignore
     return encoded.flatten(1).to(dtype or positions.dtype)

@@ -118,7 +118,9 @@ def _samples(device: torch.device, sizes: Sizes) -> Sequence[Example]:
 
 
 def _outputs(device: torch.device, sizes: Sizes) -> Sequence[Example]:
-    outputs = ((8 * spread(device, sizes.points) - 4).to(dtype) for dtype in sizes.dtypes)
+    outputs = [(8 * spread(device, sizes.points) - 4).to(dtype) for dtype in sizes.dtypes]
+    # the field's network gives colours' features beside the density
+    outputs += [each[:, None].repeat(1, 16)[:, 0] for each in outputs if sizes.in_a_step]
     inside = (spread(device, sizes.points, seed=3) < 0.7).float()
     return [{"before": each.requires_grad_(), "inside": inside, "scale": 0.01} for each in outputs]
 
