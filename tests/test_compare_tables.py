@@ -255,6 +255,8 @@ def test_tables_say_whose_the_monocular_maps_are(results):
 
 def test_runs_that_differ_in_unnamed_fields_are_refused(results):
     check_fair(results)
+    results.runs[0].content["configuration"]["machine.device_type"] = "'cuda'"
+    check_fair(results)
     results.runs[-1].content["configuration"]["b"] = "2"
     with pytest.raises(InputError, match=r"its b is 2, that of .* is None.*another version"):
         check_fair(results)

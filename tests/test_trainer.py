@@ -20,6 +20,7 @@ from scenes import fisheye, transforms, write_scene
 from trainings import trainer_of
 
 from edge_depth_nerf import cli
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.jobs.runs import newest_checkpoint
@@ -193,6 +194,14 @@ def test_a_relative_scene_is_said_to_be_relative(trainer, tmp_path, monkeypatch)
     trainer.config.pipeline.datamanager.data = Path("elsewhere")
     with pytest.raises(FileNotFoundError, match=f"searched in {tmp_path}: relative paths start at the current folder"):
         trainer.config.save_config()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_configuration_of_a_gpu_is_not_trained_without_one(trainer):
+    trainer.config.machine.device_type = "cuda"
+    with pytest.raises(InputError, match=r"finds no GPU here .* Add --machine.device-type cpu"):
+        trainer.config.save_config()
+    assert not (trainer.config.get_base_dir() / "config.yml").exists()
 
 
 def test_the_full_model_without_a_gpu_is_advised_against(scene, tmp_path, capsys):

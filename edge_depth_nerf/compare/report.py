@@ -66,7 +66,7 @@ def _shared(results: Results) -> Facts:
         "Steps of each run": f"{run.content['steps']:,}",
         "Seeds": ", ".join(map(str, results.seeds())),
         "nerfacto, UrbanNeRF and DS-NeRF": "in the same kernels as ours",
-        "Trained on": run.content["device"],
+        "Trained on": ", ".join(sorted({str(each.content["device"]) for each in results.runs})),
         "Cores of the machine": str(results.cores),
     }
     return Facts("Comparison", entries)

@@ -15,7 +15,9 @@ PROGRESS = "progress.json"
 VIEWS = "views"
 """Folder of the evaluated views."""
 
-OF_A_RUN = ("machine.seed", "pipeline.datamanager.data", "output_dir", "experiment_name")
+OF_A_MACHINE = ("machine.device_type", "pipeline.model.eval_num_rays_per_chunk", "viewer.num_rays_per_chunk")
+"""Fields of the configuration that are set for a GPU or for a CPU."""
+OF_A_RUN = ("machine.seed", "pipeline.datamanager.data", "output_dir", "experiment_name", *OF_A_MACHINE)
 """Fields of the configuration that any two runs may differ in."""
 
 

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from rich.console import Console
 
 from edge_depth_nerf.base.console import say, told
@@ -91,7 +92,7 @@ def stages_of(options: DemoOptions) -> Stages:
             methods=COMPARED,
             steps=options.steps,
             # side by side, each on its share of the cores: two threads do not make one training twice as fast
-            jobs=len(COMPARED),
+            jobs=1 if torch.cuda.is_available() else len(COMPARED),
         ),
     )
 

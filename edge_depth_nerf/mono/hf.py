@@ -45,21 +45,16 @@ class ReadyNetwork:
     @torch.inference_mode()
     def __call__(self, pictures: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.float32]]:
         """Predict pictures of one size; each map has its picture's size."""
-        # one by one in main memory, which large networks fill
-        together = len(pictures) if self._device.type == "cuda" else 1
         maps = []
-        for start in range(0, len(pictures), together):
-            part = list(pictures[start : start + together])
-            inputs = self._processor(images=part, input_data_format="channels_last", return_tensors="pt")
+        # one by one: large networks fill the memory, and ZoeDepth takes the same one of its heads for all of a batch
+        for picture in pictures:
+            inputs = self._processor(images=[picture], input_data_format="channels_last", return_tensors="pt")
             outputs = self._model(**inputs.to(self._device))
-            sizes = [picture.shape[:2] for picture in part]
-            more = {"source_sizes": sizes} if self._takes_source_sizes else {}
-            found = self._processor.post_process_depth_estimation(outputs, target_sizes=sizes, **more)
+            size = picture.shape[:2]
+            more = {"source_sizes": [size]} if self._takes_source_sizes else {}
+            (found,) = self._processor.post_process_depth_estimation(outputs, target_sizes=[size], **more)
             # a side of one pixel is squeezed away
-            maps += [
-                each["predicted_depth"].float().cpu().numpy().reshape(size)
-                for each, size in zip(found, sizes, strict=True)
-            ]
+            maps.append(found["predicted_depth"].float().cpu().numpy().reshape(size))
         return maps
 
 

@@ -79,9 +79,15 @@ class EdgeDepthTrainerConfig(TrainerConfig, TrainingOptions):
 
         Raises:
             FileNotFoundError: there is no scene at `--data`; then nothing is written.
+            InputError: it is to train on a GPU where there is none.
         """
         say_errors_plainly()
         ignore_deprecations_of_host()
+        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+            raise InputError(
+                "--machine.device-type cuda: torch finds no GPU here (`edge-depth-nerf doctor` says why). Add "
+                "--machine.device-type cpu."
+            )
         data: Any = self.pipeline.datamanager
         if isinstance(data.dataparser, FisheyeDepthDataParserConfig):
             transforms_path(Path(data.data or data.dataparser.data))

@@ -95,7 +95,8 @@ class Uploads:
         self._batch.copy_(self._buffers[0], non_blocking=True)
         if self._device.type == "cuda":
             self._copied[0] = torch.cuda.Event()
-            self._copied[0].record()
+            # the present device may be another one
+            self._copied[0].record(torch.cuda.current_stream(self._device))
         # they take turns: the first one is read next
         self._buffers.reverse()
         self._copied.reverse()
