@@ -271,6 +271,11 @@ def test_examples_of_a_step_have_the_full_presets_sizes():
     assert model.num_nerf_samples_per_ray == functions.SAMPLES
     assert (model.num_levels, model.proposal_net_args_list[0]["num_levels"]) == functions.LEVELS
     assert all(form.in_a_step(CPU) for form in step_kernels())
+    # the field's densities are a column of its network's outputs
+    strides, form = [], next(each for each in step_kernels() if each.name == "density")
+    for example in form.in_a_step(CPU):
+        back_ends._outcome(lambda before, **_: strides.append(before.stride(0)) or before, example)
+    assert strides == [1, 16]
 
 
 @pytest.mark.slow

@@ -303,9 +303,11 @@ def test_after_a_failure_the_generator_draws_again_what_it_would_have_drawn(monk
     capture._device, capture._random_state, capture._pool = torch.device("cuda:0"), torch.tensor([7]), (0, 1)
     monkeypatch.setattr(torch.cuda, "default_generators", (generator,))
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 2))
+    ended = []
+    monkeypatch.setattr(torch._C, "_cuda_endAllocateToPool", lambda *given: ended.append(given), raising=False)
     capture.recover()
     assert not generator.state.records and generator.state.value == 7
-    assert capture._pool == (0, 2)  # to the one before torch still records
+    assert ended == [(0, (0, 1))] and capture._pool == (0, 2)  # to the one before torch still recorded
 
 
 def test_a_recording_that_cannot_be_ended_leaves_the_stream_that_was(monkeypatch):

@@ -559,10 +559,11 @@ def test_a_file_that_went_away_is_said_and_the_switch_goes_back(training, capsys
 
 # ---- in a browser ----------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
-def page(browser, training):
+def page(browser, training, request):
     """The viewer in a browser without a network, looking at the drive from above; the training waits."""
     # nerfstudio ends a rendering by an exception in any line, which a checker would take for a wrong type
     jaxtyping.config.update("jaxtyping_disable", True)
+    request.addfinalizer(lambda: jaxtyping.config.update("jaxtyping_disable", False))
     server = training.viewer.viser_server
     here = f"http://127.0.0.1:{server.get_port()}"
     page = browser.new_page(viewport={"width": 900, "height": 620})
@@ -575,7 +576,6 @@ def page(browser, training):
     look_from_above(training)
     yield page
     training.trainer.training_state = "training"
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def look_from_above(training) -> None:

@@ -101,7 +101,7 @@ class GpuCapture:
         generator = torch.cuda.default_generators[index]
         generator.graphsafe_set_state(generator.clone_state())
         generator.set_state(self._random_state)
-        with suppress(AttributeError, RuntimeError):  # torch 2.6 has no such function; later ones may have ended it
+        with suppress(AttributeError, RuntimeError):  # not in each torch, and some have ended it
             torch._C._cuda_endAllocateToPool(index, self._pool)
         self._pool = torch.cuda.graph_pool_handle()
 
