@@ -262,12 +262,18 @@ def test_poses_turn_about_x_then_y_then_z(tmp_path: Path) -> None:
     np.testing.assert_array_equal(poses[0][:3, 3], 0)
 
 
-def test_frames_without_sweep_are_skipped_and_keep_the_others_times(raw: Path, tmp_path: Path) -> None:
-    """Some of KITTI's drives lack sweeps; their lines of times are there."""
+@pytest.mark.parametrize("empty", [False, True])
+def test_frames_without_sweep_keep_the_others_times(raw: Path, tmp_path: Path, empty: bool) -> None:
+    """Some of KITTI's drives lack sweeps, and their lines of times are empty."""
     root = Path(shutil.copytree(raw, tmp_path / "raw"))
-    (root / f"{DRIVE[:10]}/{DRIVE}/velodyne_points/data/0000000002.bin").unlink()
+    scans = root / f"{DRIVE[:10]}/{DRIVE}/velodyne_points"
+    (scans / "data/0000000002.bin").unlink()
+    lines = (scans / "timestamps.txt").read_text().splitlines(keepends=True)
+    (scans / "timestamps.txt").write_text("".join([*lines[:2], "\n" if empty else lines[2], *lines[3:]]))
     recording = read_kitti(options(root))
     assert [sweep.time_s - FIRST_S for sweep in recording.sweeps] == pytest.approx([0, 0.1, 0.3, 0.4, 0.5], abs=1e-6)
+    front = [each.time_s - FIRST_S for each in recording.pictures if each.camera == "image_02"]
+    assert front == pytest.approx(np.arange(6) / 10, abs=1e-6)
 
 
 DAY, FOLDER = DRIVE[:10], f"{DRIVE[:10]}/{DRIVE}"

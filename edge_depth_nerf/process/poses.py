@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from edge_depth_nerf.base.bounds import MAX_TIME_S, shown, text_lines
+from edge_depth_nerf.base.bounds import MAX_LENGTH_M, MAX_TIME_S, shown, text_lines
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.cameras.transforms import Transform, check_rigid, rigid
@@ -45,7 +45,7 @@ def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarr
         FileNotFoundError: there is no such file.
         InputError: a line is not such a pose, or the times do not increase.
     """
-    times, poses, doubled = [], [], []
+    lines, rows = [], []
     for line, values in _number_lines(path):
         if len(values) != 8:
             of_euroc = " as EuRoC's ground truth has (nanoseconds, and qw first)" if len(values) == 17 else ""
@@ -55,24 +55,31 @@ def read_tum(path: Path) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarr
             )
         if abs(values[0]) > MAX_TIME_S:
             raise InputError(f"{path}, line {line}: its time {values[0]:g} is no time in seconds.")
-        pose = pose_of_quaternion(values[1:4], values[4:], f"{path}, line {line}")
-        if times and values[0] == times[-1] and _same(pose, poses[-1]):
-            # sensors that were read at once bring the vehicle's pose each
-            continue
-        if times and not values[0] > times[-1]:
+        lines.append(line)
+        rows.append(values)
+    table = np.array(rows, np.float64).reshape(-1, 8)
+    turned = np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) <= QUATERNION_TOLERANCE
+    for index in np.flatnonzero(~turned | (np.abs(table[:, 1:4]) > MAX_LENGTH_M).any(axis=1))[:1]:
+        # it says what is wrong
+        pose_of_quaternion(rows[index][1:4], rows[index][4:], f"{path}, line {lines[index]}")
+    poses = rigid(Rotation.from_quat(table[:, 4:]).as_matrix(), table[:, 1:4]) if rows else np.empty((0, 4, 4))
+    kept, doubled = [0] * bool(rows), []
+    for index, (before_s, time_s) in enumerate(pairwise(table[:, 0].tolist()), 1):
+        if time_s > before_s:
+            kept.append(index)
+        # sensors that were read at once bring the vehicle's pose each
+        elif not (time_s == before_s and _same(poses[index], poses[kept[-1]])):
             said = (
-                f"{path}, line {line}: its time {values[0]:.6f} is not after {times[-1]:.6f} of the line before. Sort "
-                f"them by time; poses of one time must agree within {100 * SAME_POSE_M:g} cm and {SAME_POSE_DEG:g}°."
+                f"{path}, line {lines[index]}: its time {time_s:.6f} is not after {before_s:.6f} of the line before. "
+                f"Sort them by time; poses of one time must agree within {100 * SAME_POSE_M:g} cm and "
+                f"{SAME_POSE_DEG:g}°."
             )
-            if values[0] < times[-1]:
+            if time_s < before_s:
                 raise InputError(said)
-            doubled.append((line, said))
-            continue
-        times.append(values[0])
-        poses.append(pose)
-    if len(doubled) > max(DOUBLED_SHARE * len(times), len(times) >= FEW_POSES):
+            doubled.append((lines[index], said))
+    if len(doubled) > max(DOUBLED_SHARE * len(kept), len(kept) >= FEW_POSES):
         raise InputError(doubled[0][1])
-    return np.array(times, np.float64), np.array(poses, np.float64).reshape(-1, 4, 4), [line for line, _ in doubled]
+    return table[kept, 0], poses[kept], [line for line, _ in doubled]
 
 
 def tum_text(times_s: Float64[np.ndarray, "poses"], poses: Float64[np.ndarray, "poses 4 4"]) -> str:
@@ -172,6 +179,8 @@ def read_times(path: Path, unit: str = "s") -> list[tuple[str | None, float]]:
 def read_frame_times(path: Path, otherwise: str = "") -> list[float]:
     """Read the times of a data set's frames, a line each; `otherwise`: what else to do than to copy the file again.
 
+    The line of a lost frame is empty, as in some of KITTI's drives. It gets a time between its neighbours.
+
     Raises:
         FileNotFoundError: there is no such file.
         InputError: a line is no time, or not after the one before.
@@ -182,7 +191,9 @@ def read_frame_times(path: Path, otherwise: str = "") -> list[float]:
             raise InputError(
                 f"{path}, line {line}: not after the line before. Copy the file again from the data set{otherwise}."
             )
-    return times_s
+    lines = [line for line, _ in _lines(path)]
+    every = np.arange(1, lines[-1] + 1) if lines else np.zeros(0)
+    return np.interp(every, lines, times_s).tolist() if lines else []
 
 
 def _time_of_line(words: list[str], first: str, where: str) -> tuple[str, str | None, float]:

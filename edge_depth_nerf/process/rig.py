@@ -118,14 +118,14 @@ def recording_of_rig(rig: Rig, options: _Options, kind: str, numbered: Numbered 
     """
     root, cameras = options.root, _chosen(rig, options.cameras)
     files = {camera.name: _timed(_files(root, camera.images, IMAGE_SUFFIXES), camera, numbered) for camera in cameras}
-    path, camera_poses = numbered.path if numbered else None, {}
+    path, camera_poses, doubled = numbered.path if numbered else None, {}, []
     if options.poses == "recorded" and numbered is None:
         if rig.poses is None:
             raise InputError(
                 f"{rig.path}: has no table [poses]. Give poses (docs/rig.md), or compute them: --poses lidar, "
                 "--poses colmap."
             )
-        path, camera_poses = _path(rig, rig.poses, cameras, files)
+        path, camera_poses, doubled = _path(rig, rig.poses, cameras, files)
     scans = [_Scans(lidar, _timed(_files(root, lidar.scans, SCAN_SUFFIXES), lidar, numbered)) for lidar in rig.lidars]
     _check_clocks(rig, files, scans, path)
 
@@ -158,7 +158,7 @@ def recording_of_rig(rig: Rig, options: _Options, kind: str, numbered: Numbered 
         skipped=tuple(skipped),
         left_out=tolerance.left_out,
         notices=(
-            *_doubled(rig.poses if path is not None else None),
+            *_doubled(rig.poses, doubled),
             *(
                 f"{lidar.name}: neither turn_s with direction nor point_times is given; all its points get one time."
                 for lidar in rig.lidars
@@ -169,14 +169,12 @@ def recording_of_rig(rig: Rig, options: _Options, kind: str, numbered: Numbered 
     )
 
 
-def _doubled(poses: RigPoses | None) -> list[str]:
+def _doubled(poses: RigPoses | None, lines: Sequence[int]) -> list[str]:
     """Say which lines of a file of poses are left out."""
-    if poses is None or poses.format != "tum":
+    if poses is None or not lines:
         return []
-    _, _, lines = read_tum(poses.file)
     some = ", ".join(map(str, lines[:5])) + (" …" if len(lines) > 5 else "")
-    said = f"{poses.file}: {len(lines)} poses are left out, each of the time of the line before (line {some})."
-    return [said] if lines else []
+    return [f"{poses.file}: {len(lines)} poses are left out, each of the time of the line before (line {some})."]
 
 
 def _turned_notice(camera: str, orientations: Counter[int]) -> str:
@@ -363,9 +361,10 @@ def _usable(
     """The requested frames, by number, without frames and pictures that cannot be used; and the latter."""
     kept: dict[int, dict[str, _Timed]] = {}
     skipped: list[Skipped] = []
+    slack_s = 0.0 if path is None else min(0.1, 0.5 * _interval(path.times_s.tolist()))
     for frame in options.chosen_frames(len(frames) - 1, "the recording has frames 0"):
         pictures = frames[frame]
-        if reason := _unusable(pictures, path, scans):
+        if reason := _unusable(pictures, path, slack_s, scans):
             skipped.append(Skipped(frame, None, reason))
             continue
         lacking = [name for name, picture in pictures.items() if camera_poses and picture.path not in camera_poses]
@@ -375,11 +374,12 @@ def _usable(
     return kept, skipped
 
 
-def _unusable(pictures: dict[str, _Timed], path: Trajectory | None, scans: Sequence[_Scans]) -> str | None:
-    """Why a frame cannot be used, if it cannot."""
+def _unusable(
+    pictures: dict[str, _Timed], path: Trajectory | None, slack_s: float, scans: Sequence[_Scans]
+) -> str | None:
+    """Why a frame cannot be used, if it cannot; it may be `slack_s` before the first pose or after the last."""
     time_s = _time(pictures)
     if path is not None:
-        slack_s = min(0.1, 0.5 * _interval(path.times_s.tolist()))
         if path.outside_s(time_s) > slack_s:
             return "before the first or after the last pose"
         if path.outside_s(time_s) == 0 and path.gap_s(time_s) > MAX_POSE_GAP_S:
@@ -394,15 +394,16 @@ def _unusable(pictures: dict[str, _Timed], path: Trajectory | None, scans: Seque
 
 def _path(
     rig: Rig, poses: RigPoses, cameras: Sequence[RigCamera], files: dict[str, list[_Timed]]
-) -> tuple[Trajectory, dict[Path, Transform]]:
-    """The vehicle's path; and each picture's own pose, where the file has these."""
+) -> tuple[Trajectory, dict[Path, Transform], list[int]]:
+    """The vehicle's path; each picture's own pose, where the file has these; and the lines that are left out."""
     of_pictures: dict[Path, Transform] = {}
+    doubled: list[int] = []
     if poses.format == "nerfstudio":
         times, sensor_to_world, to_vehicle, of_pictures = _picture_poses(poses, cameras, files)
     else:
         sensors = {sensor.name: sensor.to_vehicle for sensor in (*rig.cameras, *rig.lidars)}
         to_vehicle = sensors.get(poses.of, np.eye(4))
-        times, sensor_to_world = _pose_list(poses)
+        times, sensor_to_world, doubled = _pose_list(poses)
     if len(times) < 2:
         raise InputError(
             f"{poses.file}: {len(times)} pose{'' if len(times) == 1 else 's'}, expected at least two, for the "
@@ -418,13 +419,12 @@ def _path(
     vehicle_to_world = in_metres(sensor_to_world) @ np.linalg.inv(to_vehicle)
     with found_in(str(poses.file)):
         path = Trajectory(times, vehicle_to_world)
-    return path, {file: in_metres(pose) for file, pose in of_pictures.items()}
+    return path, {file: in_metres(pose) for file, pose in of_pictures.items()}, doubled
 
 
-def _pose_list(poses: RigPoses) -> tuple[np.ndarray, np.ndarray]:
+def _pose_list(poses: RigPoses) -> tuple[np.ndarray, np.ndarray, list[int]]:
     if poses.format == "tum":
-        times, matrices, _ = read_tum(poses.file)
-        return times, matrices
+        return read_tum(poses.file)
     matrices, times_file = read_kitti(poses.file), poses.times_file
     if poses.times_from_names:
         raise InputError(f"{poses.file}: KITTI's poses have no names; give poses.times_file or poses.rate_hz.")
@@ -433,7 +433,7 @@ def _pose_list(poses: RigPoses) -> tuple[np.ndarray, np.ndarray]:
         counts = [time for _, time in read_times(times_file, poses.time_unit)]
     if len(counts) != len(matrices):
         raise InputError(f"{times_file}: {len(counts)} times for the {len(matrices)} poses of {poses.file.name}.")
-    return np.array(poses.seconds(counts), np.float64), matrices
+    return np.array(poses.seconds(counts), np.float64), matrices, []
 
 
 def _picture_poses(
