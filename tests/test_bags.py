@@ -2,7 +2,9 @@
 
 import io
 import math
+import re
 import shutil
+import struct
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +16,7 @@ import cv2
 import data_sets
 import numpy as np
 import pytest
+from backports import zstd
 from numpy.typing import NDArray
 from rich.console import Console
 from scenes import tree
@@ -21,8 +24,10 @@ from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_image
-from edge_depth_nerf.process.bags import command, lenses, pictures, scans
+from edge_depth_nerf.process.bags import command, lenses, pictures, scans, survey
+from edge_depth_nerf.process.bags.bag import Topic
 from edge_depth_nerf.process.bags.command import todo_lines, unpack
+from edge_depth_nerf.process.bags.frames import by_satellite
 from edge_depth_nerf.process.bags.options import UnpackOptions
 from edge_depth_nerf.process.converters import convert
 from edge_depth_nerf.process.options import RigOptions
@@ -133,6 +138,8 @@ def test_a_part_of_a_bag(whole: tuple[Path, Path], tmp_path: Path) -> None:
     """The bag begins 0.2 s before the first picture."""
     run(whole[0], tmp_path / "part", start_s=0.3, seconds=0.25)
     assert len(list((tmp_path / "part/images/front").iterdir())) == 3
+    # with poses that were recorded before and after
+    assert len(read_tum(tmp_path / "part/poses.txt")[0]) == 50
     with pytest.raises(InputError, match=r"--start-s 9: .* ends 0\.98 s after its start"):
         run(whole[0], tmp_path / "none", start_s=9.0)
 
@@ -182,6 +189,47 @@ def test_poses_of_each_kind(tmp_path: Path, source: str) -> None:
         expected = bags.world(time - bags.FIRST_NS / 1e9)
         np.testing.assert_allclose(pose[:3, :3], expected[:3, :3], atol=1e-4)
         np.testing.assert_allclose(pose[:3, 3], expected[:3, 3] - origin, atol=2e-3)
+
+
+def test_fixes_a_second_apart_have_poses_between_them(tmp_path: Path) -> None:
+    """The vehicle turns with 1 Hz while fixes come each second, with some milliseconds of delay, and then stop."""
+    seconds = np.arange(0, 9, 0.01)
+    angle = 0.25 * np.sin(2 * np.pi * seconds)
+    fixes = [(number + 0.002 * (number % 2), 49 + number * 1e-4, 8.4, 115) for number in (0, 1, 2, 3, 4, 8)]
+    turns = np.column_stack((seconds, Rotation.from_euler("z", angle[:, None]).as_quat()))
+    times_s, poses = by_satellite(np.array(fixes), turns, np.eye(4), np.eye(4))
+    # none where fixes are missing for 4 s
+    assert times_s[-1] == 4 and np.diff(times_s).max() < 0.011
+    found = Rotation.from_matrix(poses[:, :3, :3]).as_euler("zyx")[:, 0]
+    np.testing.assert_allclose(found, 0.25 * np.sin(2 * np.pi * times_s), atol=1e-3)
+    metres_a_second = poses[-1, 1, 3] / 4
+    assert 11.1 < metres_a_second < 11.2
+    np.testing.assert_allclose(poses[:, 1, 3], metres_a_second * times_s, atol=0.05)
+    assert len(by_satellite(np.array(fixes)[:1], turns, np.eye(4), np.eye(4))[0]) == 0
+
+
+def test_the_first_source_that_has_poses_is_taken(tmp_path: Path) -> None:
+    """/tf repeats the mountings, as ROS 1 publishes them, and no vehicle's pose."""
+    said = [each for each in bags.hall(poses=False, mounted=False) if "lidar" not in each.topic]
+    for step in range(-10, 40):
+        said += [each for each in pose_messages("gps", step * 0.02) if each.topic != "/more/tf_static"]
+    both = [bags.transform(0, "base_link", "gps", ANTENNA), bags.transform(0, "base_link", "imu", TURNED)]
+    mounted = [*bags.mountings().fields["transforms"], *both]
+    for seconds in (-0.1, 0.3):
+        sent = [{**each, "header": bags.header(seconds, each["header"]["frame_id"])} for each in mounted]
+        said.append(bags.Said("/tf", "tf2_msgs/msg/TFMessage", seconds, {"transforms": sent}))
+    bag = bags.write_bag(tmp_path, "bag", said)
+    listed = {
+        line.split("│")[0].strip(): line.split("│")[-1].strip() for line in run(bag, None, list=True).splitlines()
+    }
+    assert listed["/tf"] == "poses, mountings, where nothing moves"
+    assert listed["/fix"] == listed["/imu"] == "poses, if /tf has none; --poses chooses"
+    text = run(bag, tmp_path / "recording")
+    assert "/tf: has 0 poses of base_link; at least two are needed." in text
+    times, poses, _ = read_tum(tmp_path / "recording/poses.txt")
+    expected = np.array([bags.world(time - bags.FIRST_NS / 1e9) for time in times])
+    np.testing.assert_allclose(poses[:, :3, :3], expected[:, :3, :3], atol=1e-4)
+    assert "by /fix and /imu" in (tmp_path / "recording/rig.toml").read_text()
 
 
 EARTH = (6378137.0, 6.69437999014e-3)
@@ -254,10 +302,28 @@ def test_bags_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "two/drive.mcap").write_bytes(b"\x89MCAP0\r\n")
     with pytest.raises(InputError, match="bags of different kinds"):
         run(bag.parent, tmp_path / "recording")
+    (tmp_path / "two/drive.mcap").write_bytes(b"\x89MCAP0\r\n\x01" + struct.pack("<QI4sI", 12, 4, b"ros1", 0))
+    with pytest.raises(InputError, match=r"drive\.mcap: is an MCAP file of ROS 1\. Give the \.bag"):
+        run(tmp_path / "two/drive.mcap", tmp_path / "recording")
     bag = bags.write_bag(tmp_path / "log", "db3", list(bags.hall()))
     next(bag.glob("*.db3")).with_name(f"{next(bag.glob('*.db3')).name}-wal").write_bytes(b"more")
     with pytest.raises(InputError, match="PRAGMA wal_checkpoint"):
         run(bag, tmp_path / "recording")
+
+
+@pytest.mark.parametrize("whole", ["mcap"], indirect=True)
+def test_folders_of_other_names_and_compressed_files(whole: tuple[Path, Path], tmp_path: Path) -> None:
+    bag = shutil.copytree(whole[0], tmp_path / "drive.bag")
+    expected = run(whole[0], None, list=True).splitlines()[1:]
+    assert "pictures of front" in "".join(expected)
+    assert run(bag, None, list=True).splitlines()[1:] == expected
+    (file,) = bag.glob("*.mcap")
+    file.with_name(f"{file.name}.zstd").write_bytes(zstd.compress(file.read_bytes()))
+    file.unlink()
+    metadata = (bag / "metadata.yaml").read_text().replace(f"- {file.name}", f"- {file.name}.zstd")
+    metadata = re.sub("compression_format: .*", "compression_format: zstd", metadata)
+    (bag / "metadata.yaml").write_text(re.sub("compression_mode: .*", "compression_mode: FILE", metadata))
+    assert run(bag, None, list=True).splitlines()[1:] == expected
 
 
 def test_bags_without_pictures_and_with_unknown_types(tmp_path: Path) -> None:
@@ -362,6 +428,51 @@ def test_one_topic_of_each_camera_and_scanner(tmp_path: Path) -> None:
     assert {path.suffix for path in (tmp_path / "recording/images/front").iterdir()} == {".jpg"}
 
 
+def test_a_stereo_pair_with_one_frame(tmp_path: Path) -> None:
+    """ROS's rectified pairs have the left camera's frame; the right one's place is in its P."""
+    said = [bags.mountings(), *(bags.odometry(step * 0.02) for step in range(-10, 40))]
+    for side, column in (("left", 0.0), ("right", -data_sets.FOCAL * 0.5)):
+        for number in range(data_sets.FRAMES):
+            picture = bags.image("front", number, data_sets.picture("front", number), compressed=False)
+            said.append(replace(picture, topic=f"/stereo/{side}/image_rect"))
+        made = bags.camera_info("front", 0.0)
+        projection = np.array(made.fields["p"], float)
+        projection[3] = column
+        said.append(replace(made, topic=f"/stereo/{side}/camera_info", fields={**made.fields, "p": projection}))
+    run(bags.write_bag(tmp_path, "mcap", said), tmp_path / "recording")
+    rig = read_rig(tmp_path / "recording/rig.toml", tmp_path / "recording")
+    left, right = (next(each.to_vehicle for each in rig.cameras if each.name == name) for name in ("left", "right"))
+    np.testing.assert_allclose(left, data_sets.to_vehicle("front"), atol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.inv(left) @ right, data_sets.rigid(Rotation.identity(), [0.5, 0, 0]), atol=1e-9
+    )
+    assert "# 0.5 m from the origin of its frame, by P" in (tmp_path / "recording/rig.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        *((f"/left/{name}", True) for name in ("image_rect", "image_rect_color", "rectified/image", "rect/compressed")),
+        *((f"/{name}/image_raw", False) for name in ("camera_direct", "rectangle", "correct")),
+    ],
+)
+def test_which_topics_are_rectified(topic: str, rectified: bool) -> None:
+    assert survey._rectified(Topic(topic, survey.IMAGE, 1, 0.0, True)) is rectified
+
+
+def test_a_bright_street_after_a_dark_garage(tmp_path: Path) -> None:
+    """Pictures of 12 bits are as bright as others, even if the first ones use fewer; what is beyond them is told."""
+    said = []
+    for number in range(24):
+        table = np.full((4, 6), 900 if number < 8 else 3000 if number < 23 else 5000, np.uint16)
+        head = {"header": bags.header(number * 0.1, "c"), "height": 4, "width": 6, "step": 12, "encoding": "mono16"}
+        said.append(bags.Said("/c", survey.IMAGE, number * 0.1, {**head, "data": table.view(np.uint8).ravel()}))
+    text = run(bags.write_bag(tmp_path, "mcap", said), tmp_path / "recording")
+    assert "/c: 1 pictures are white where they use more than 12 bits." in text
+    found = [read_image(path).max() for path in sorted((tmp_path / "recording/images/c").iterdir())]
+    assert found == [900 >> 4] * 8 + [3000 >> 4] * 15 + [255]
+
+
 def test_livox(tmp_path: Path) -> None:
     """Its own message, whose definition is in the bag."""
     types = {
@@ -427,7 +538,7 @@ ALPHA = np.full((*GREY.shape, 1), 9, np.uint8)
 def test_encodings(encoding: str, table: NDArray, expected: NDArray, big: bool) -> None:
     made = message(encoding, table.reshape(len(table), -1), big=big)
     assert pictures.why_no_picture(made) is None
-    np.testing.assert_array_equal(pictures.decode(made, pictures.bits_used([made])), expected)
+    np.testing.assert_array_equal(pictures.decode(made, pictures.bits_used(made)), expected)
 
 
 @pytest.mark.parametrize("bits", [10, 12, 14, 16])
@@ -435,7 +546,7 @@ def test_pictures_of_16_bits_are_as_bright_as_their_sensor_says(bits: int) -> No
     table = GREY.astype(np.uint16) << (bits - 8)
     table[0, 0] = (1 << bits) - 1
     made = message("mono16", table)
-    assert pictures.bits_used([made]) == bits
+    assert pictures.bits_used(made) == bits
     np.testing.assert_array_equal(pictures.decode(made, bits)[1:], GREY[1:])
 
 
@@ -560,7 +671,7 @@ def info(**changes: Any) -> Any:
 
 
 def lens(made: Any, width: int = 640, height: int = 480, rectified: bool = False) -> dict[str, Any]:
-    found = lenses.lens_of(made, width, height, rectified)
+    found = lenses.lens_of(made, width, height, rectified, False)
     assert isinstance(found, lenses.Lens), found
     return found.keys
 
@@ -598,7 +709,7 @@ def test_a_rational_distortion_is_fitted() -> None:
         found, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, four)
     assert np.sqrt(((found - expected) ** 2).sum(-1).mean()) < 0.3
     hopeless = lenses.lens_of(
-        info(distortion_model="rational_polynomial", d=[30, -20, 0.1, 0.1, 3, 0, 0, 9]), 640, 480, False
+        info(distortion_model="rational_polynomial", d=[30, -20, 0.1, 0.1, 3, 0, 0, 9]), 640, 480, False, False
     )
     assert isinstance(hopeless, str) and "has no equal here" in hopeless
 
@@ -612,7 +723,7 @@ def test_parts_of_pictures() -> None:
     assert (20 - keys["cy"]) / keys["fy"] == pytest.approx((100.5 - 240) / 410)
     keys = lens(info(), 320, 240)
     assert (10 - keys["cx"]) / keys["fx"] == pytest.approx((20.5 - 320) / 400)
-    found = lenses.lens_of(info(), 320, 320, False)
+    found = lenses.lens_of(info(), 320, 320, False, False)
     assert isinstance(found, str) and "is of 640×480 px, its pictures of 320×320 px" in found
-    assert "not calibrated" in str(lenses.lens_of(info(k=[0.0] * 9), 640, 480, False))
-    assert "'ftheta' is not known" in str(lenses.lens_of(info(distortion_model="ftheta"), 640, 480, False))
+    assert "not calibrated" in str(lenses.lens_of(info(k=[0.0] * 9), 640, 480, False, False))
+    assert "'ftheta' is not known" in str(lenses.lens_of(info(distortion_model="ftheta"), 640, 480, False, False))

@@ -65,7 +65,7 @@ class Bag:
         # a folder of ROS 2's with its metadata, or each file
         parts = [path] if (path / "metadata.yaml").is_file() else self.files
         self._readers = [self._opened(part) for part in parts]
-        self._is_ros1 = self.files[0].suffix == ".bag"
+        self._is_ros1 = _is_ros1(self.files[0])
         connections = [connection for reader in self._readers for connection in reader.connections]
         self._store = self._typestore(connections)
         self.start_ns = min((reader.start_time for reader in self._readers if reader.message_count), default=0)
@@ -85,9 +85,11 @@ class Bag:
         from rosbags.rosbag2 import Reader as Reader2
 
         try:
-            return self._stack.enter_context(Reader1(path) if path.suffix == ".bag" else Reader2(path))
+            return self._stack.enter_context(Reader1(path) if _is_ros1(path) else Reader2(path))
         except Exception as error:  # the library raises whatever its parsers meet
             self._stack.close()
+            if "Profile is not ros2" in str(error):
+                raise InputError(f"{path}: is an MCAP file of ROS 1. Give the .bag that it was made from.") from None
             raise InputError(f"{path}: cannot be opened as a ROS bag ({_said(error)}). {_REPAIR}") from None
 
     def _typestore(self, connections: Collection[Any]) -> Any:
@@ -172,14 +174,20 @@ def _said(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
 
+def _is_ros1(path: Path) -> bool:
+    return path.suffix == ".bag" and path.is_file()
+
+
 def _files(path: Path) -> list[Path]:
     """The files of a bag."""
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder; expected a ROS bag (.bag, .mcap, .db3).")
     found = [path]
     if path.is_dir():
-        found = sorted(entry for entry in path.iterdir() if entry.suffix in _SUFFIXES)
-    if not found or found[0].suffix not in _SUFFIXES:
+        # ROS 2 may compress whole files, and writes so into the metadata
+        kinds = (*_SUFFIXES, ".zstd") if (path / "metadata.yaml").is_file() else _SUFFIXES
+        found = sorted(entry for entry in path.iterdir() if entry.suffix in kinds)
+    if not found or (found == [path] and path.suffix not in _SUFFIXES):
         recording = " A .bag.active is not closed yet: run `rosbag reindex`." if path.suffix == ".active" else ""
         compressed = " Unpack it with zstd first." if path.suffix in (".zst", ".zstd") else ""
         raise InputError(

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 from rich.console import Console
 from rich.table import Table
 
@@ -46,7 +47,7 @@ from edge_depth_nerf.process.bags.frames import (
 )
 from edge_depth_nerf.process.bags.lenses import Lens
 from edge_depth_nerf.process.bags.options import UnpackOptions
-from edge_depth_nerf.process.bags.pictures import file_of
+from edge_depth_nerf.process.bags.pictures import bits_used, file_of
 from edge_depth_nerf.process.bags.rig_text import rig_text
 from edge_depth_nerf.process.bags.survey import (
     FIX,
@@ -68,6 +69,8 @@ _MOST_BROKEN = 0.1
 _UPWARD = 0.9
 """A camera whose axis points up so steeply has a frame with x forward, not an optical one."""
 _MAX_THREADS = 8
+_LATE_NS = 2_000_000_000
+"""Poses that are recorded so much before or after the time taken are read, too."""
 
 
 def unpack(options: UnpackOptions, console: Console | None = None) -> Path | None:
@@ -151,37 +154,40 @@ class _Unpacking:
         assert options.output is not None
         self._bag, self._found, self._options, self._console = bag, found, options, console
         self._output = options.output
-        self._poses = Poses()
-        self._child = ""
-        """The frame that the poses are of."""
-        self._world = ""
-        """The frame that they are in."""
+        self._poses: dict[str, Poses] = defaultdict(Poses)
+        """By topic; an Imu's have orientations alone, fixes have degrees and metres instead of a position."""
+        self._frames: dict[str, tuple[str, str]] = {}
+        """By topic: the frame of its messages, and that which their poses are of, if they name one."""
         self._moving: dict[Edge, Poses] = defaultdict(Poses)
-        self._fixes: list[tuple[float, float, float, float]] = []
-        self._turns = Poses()
-        self._frames = {"antenna": "", "imu": ""}
         self._stamps: dict[str, set[int]] = defaultdict(set)
         """Of pictures and scans, by topic."""
         self._twice: dict[str, int] = defaultdict(int)
         self._unstamped: dict[str, int] = defaultdict(int)
+        self._burnt: dict[str, int] = defaultdict(int)
+        """Pictures that use more bits than those looked at before."""
         self._broken: dict[str, list[str]] = defaultdict(list)
         self._pending: deque[tuple[str, Future[None]]] = deque()
 
     def write(self) -> None:
         """Read the bag and write the recording."""
         found = self._found
-        special = {TF: self._take_tf, FIX: self._take_fix, IMU: self._take_imu}
+        special = {FIX: self._take_fix, IMU: self._take_imu}
         takers: dict[str, Callable[[int, Any], None]] = {}
-        for topic in (*(topic for topic in self._bag.topics if topic.type == TF), *found.poses):
-            takers[topic.name] = special.get(topic.type, self._take_pose)
-        takers |= {camera.topic.name: partial(self._take_picture, camera) for camera in found.cameras}
-        takers |= {scanner.topic.name: partial(self._take_scan, scanner) for scanner in found.scanners}
+        for topic in (topic for source in found.poses for topic in source):
+            takers[topic.name] = partial(special.get(topic.type, self._take_pose), topic.name)
+        takers |= {topic.name: self._take_tf for topic in self._bag.topics if topic.type == TF}
+        sensors = {camera.topic.name: partial(self._take_picture, camera) for camera in found.cameras}
+        sensors |= {scanner.topic.name: partial(self._take_scan, scanner) for scanner in found.scanners}
+        takers |= sensors
         start_ns, end_ns = window(self._bag, self._options)
         threads = min(os.cpu_count() or 1, _MAX_THREADS)
         with progress_bars(self._console) as progress, ThreadPoolExecutor(threads) as self._pool:
             task = progress.add_task(f"Unpacking {self._bag.path.name}", total=(end_ns - start_ns) / 1e9)
             try:
-                for topic, recorded_ns, message in self._bag.messages(takers, start_ns, end_ns):
+                # poses come late, and those around a picture are needed
+                for topic, recorded_ns, message in self._bag.messages(takers, start_ns - _LATE_NS, end_ns + _LATE_NS):
+                    if topic in sensors and not start_ns <= recorded_ns < end_ns:
+                        continue
                     stamp_ns = recorded_ns
                     if hasattr(message, "header"):
                         stamp_ns = stamp_of(message, recorded_ns)
@@ -217,6 +223,7 @@ class _Unpacking:
             self._pending.append((topic.name, self._pool.submit(write, path)))
 
     def _take_picture(self, camera: FoundCamera, stamp_ns: int, message: Any) -> None:
+        self._burnt[camera.topic.name] += bits_used(message) > camera.bits
         suffix, write = file_of(message, camera.bits)
         self._write(camera.topic, stamp_ns, self._output / "images" / camera.name / f"{stamp_ns}{suffix}", write)
 
@@ -235,6 +242,10 @@ class _Unpacking:
             say(self._console, f"{topic}: left out {len(faults)} broken messages; the first has {faults[0]}.", "yellow")
         for topic, count in self._twice.items():
             say(self._console, f"{topic}: left out {count} messages with the stamp of an earlier one.", "yellow")
+        for camera in self._found.cameras:
+            if count := self._burnt[camera.topic.name]:
+                said = f"{camera.topic.name}: {count} pictures are white where they use more than {camera.bits} bits."
+                say(self._console, said, "yellow")
         for topic, count in self._unstamped.items():
             if count:
                 said = f"{topic}: {count} messages have no stamp; the time of their recording is taken, which is later."
@@ -248,29 +259,27 @@ class _Unpacking:
             if edge not in self._found.mountings:
                 self._moving[edge].add(stamp_of(each, 0), each.transform.translation, each.transform.rotation)
 
-    def _take_pose(self, stamp_ns: int, message: Any) -> None:
-        self._world = name_of(message.header.frame_id)
-        self._child = name_of(getattr(message, "child_frame_id", ""))
+    def _take_pose(self, topic: str, stamp_ns: int, message: Any) -> None:
+        self._frames[topic] = name_of(message.header.frame_id), name_of(getattr(message, "child_frame_id", ""))
         if hasattr(message, "transform"):
-            self._poses.add(stamp_ns, message.transform.translation, message.transform.rotation)
+            self._poses[topic].add(stamp_ns, message.transform.translation, message.transform.rotation)
             return
         pose = getattr(message.pose, "pose", message.pose)
-        self._poses.add(stamp_ns, pose.position, pose.orientation)
+        self._poses[topic].add(stamp_ns, pose.position, pose.orientation)
 
-    def _take_fix(self, stamp_ns: int, message: Any) -> None:
-        numbers = (stamp_ns / 1e9, message.latitude, message.longitude, message.altitude)
-        self._frames["antenna"] = name_of(message.header.frame_id)
-        if message.status.status >= 0 and np.isfinite(numbers).all():
-            self._fixes.append(numbers)
+    def _take_fix(self, topic: str, stamp_ns: int, message: Any) -> None:
+        self._frames[topic] = name_of(message.header.frame_id), ""
+        if message.status.status >= 0:
+            self._poses[topic].add_place(stamp_ns, message.latitude, message.longitude, message.altitude)
         else:
-            self._poses.broken += 1
+            self._poses[topic].broken += 1
 
-    def _take_imu(self, stamp_ns: int, message: Any) -> None:
-        self._frames["imu"] = name_of(message.header.frame_id)
+    def _take_imu(self, topic: str, stamp_ns: int, message: Any) -> None:
+        self._frames[topic] = name_of(message.header.frame_id), ""
         # -1 in the first place says that there is no orientation
         if message.orientation_covariance[0] != -1:
             # only the orientation counts
-            self._turns.add(stamp_ns, message.angular_velocity, message.orientation)
+            self._poses[topic].add(stamp_ns, message.angular_velocity, message.orientation)
 
     # ---- what describes them -----------------------------------------------------------------------------------
 
@@ -281,8 +290,7 @@ class _Unpacking:
                 fixed[edge] = matrices(poses.table)[0]
             else:
                 moving[edge] = poses
-        vehicle = self._vehicle(fixed, moving)
-        said = self._write_poses(vehicle, fixed, moving)
+        vehicle, said = self._write_poses(fixed, moving)
         cameras = []
         for camera in self._found.cameras:
             to_vehicle = mounting(fixed, camera.frame, vehicle)
@@ -294,64 +302,63 @@ class _Unpacking:
                     "yellow",
                 )
             if to_vehicle is not None and isinstance(camera.lens, Lens):
-                to_vehicle = to_vehicle.copy()
-                to_vehicle[:3, :3] = to_vehicle[:3, :3] @ camera.lens.rotation.T
+                to_vehicle = to_vehicle @ camera.lens.to_frame
             cameras.append((camera, to_vehicle))
         scanners = [(scanner, mounting(fixed, scanner.frame, vehicle)) for scanner in self._found.scanners]
         write_text(self._output / _RIG, rig_text(self._bag.path.name, vehicle, cameras, scanners, said))
 
-    def _vehicle(self, fixed: dict[Edge, Transform], moving: dict[Edge, Poses]) -> str:
-        """The frame that all is mounted on."""
+    def _vehicle(self, fixed: dict[Edge, Transform], moving: dict[Edge, Poses], child: str = "") -> str:
+        """The frame that all is mounted on; `child`: which the poses are of, if they say so."""
         known = {frame for edge in (*fixed, *moving) for frame in edge}
         named = [frame for frame in VEHICLE_FRAMES if frame in known]
         mounted = [sensor.frame for sensor in (*self._found.scanners, *self._found.cameras)]
-        return next(filter(None, (self._options.vehicle, self._child, *named, *mounted)), "vehicle")
+        return next(filter(None, (self._options.vehicle, child, *named, *mounted)), "vehicle")
 
-    def _write_poses(self, vehicle: str, fixed: dict[Edge, Transform], moving: dict[Edge, Poses]) -> str | None:
-        """Write the poses of the vehicle; say what they are, None without any."""
-        found = self._found
-        if not found.poses:
-            return None
-        topic, times_s, poses, said = found.poses[0], np.empty(0), np.empty((0, 4, 4)), ""
+    def _write_poses(self, fixed: dict[Edge, Transform], moving: dict[Edge, Poses]) -> tuple[str, str | None]:
+        """Write the poses of the first source that has any; give the vehicle's frame, and what they are."""
+        for source in self._found.poses:
+            name = source[0].name
+            vehicle = self._vehicle(fixed, moving, self._frames.get(name, ("", ""))[1])
+            times_s, poses, said = self._poses_of(source, vehicle, fixed, moving)
+            if broken := sum(self._poses[topic.name].broken for topic in source):
+                say(self._console, f"{name}: left out {broken} messages without a pose.", "yellow")
+            if len(times_s) > 1:
+                write_text(self._output / _POSES, tum_text(times_s, poses))
+                return vehicle, said
+            found = f"{len(times_s)} poses of {vehicle}"
+            say(self._console, f"{name}: has {found}; at least two are needed. None are written.", "yellow")
+        return self._vehicle(fixed, moving), None
+
+    def _poses_of(
+        self, source: tuple[Topic, ...], vehicle: str, fixed: dict[Edge, Transform], moving: dict[Edge, Poses]
+    ) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarray, "poses 4 4"], str]:
+        """Times (s) and poses of the vehicle by a source, and a word for them."""
+        topic = source[0]
         if topic.type == TF:
-            path = path_of(moving, fixed, vehicle)
-            if path is not None:
-                times_s, poses, world = path
-                said = f"poses of {vehicle} in {world}, by {topic.name}"
-        elif topic.type == FIX:
-            places, turns = np.array(self._fixes).reshape(-1, 4), self._turns.table
-            places = places[np.unique(places[:, 0], return_index=True)[1]]
-            mounted = [mounting(fixed, self._frames[each], vehicle) for each in ("antenna", "imu")]
+            times_s, poses, world = path_of(moving, fixed, vehicle) or (np.empty(0), np.empty((0, 4, 4)), "")
+            return times_s, poses, f"poses of {vehicle} in {world}, by {topic.name}"
+        if topic.type == FIX:
+            names = [each.name for each in source]
+            places, turns = (self._poses[name].table for name in names)
+            mounted = [mounting(fixed, self._frames.get(name, ("", ""))[0], vehicle) for name in names]
             antenna, imu = (np.eye(4) if each is None else each for each in mounted)
-            if len(turns) > 1:
-                times_s, poses = by_satellite(places, np.delete(turns, (1, 2, 3), axis=1), antenna, imu)
-            unknown = [name for name, each in zip(self._frames.values(), mounted, strict=True) if each is None]
-            lacking = f"; {' and '.join(unknown)} taken to be {vehicle}, as their mountings are not known" * bool(
-                unknown
+            times_s, poses = by_satellite(places[:, :4], np.delete(turns, (1, 2, 3), axis=1), antenna, imu)
+            unknown = [name for name, each in zip(("antenna", "imu"), mounted, strict=True) if each is None]
+            said = f"poses of {vehicle}, east, north and up, by {' and '.join(names)}"
+            if unknown:
+                said += f"; {' and '.join(unknown)} taken to be {vehicle}, as their mountings are not known"
+            return times_s, poses, said
+        table = self._poses[topic.name].table
+        world, child = self._frames.get(topic.name, ("", ""))
+        onward = mounting(fixed, vehicle, child) if child else np.eye(4)
+        if onward is None:
+            raise InputError(
+                f"--vehicle {vehicle}: the poses of {topic.name} are of {child}, and no mounting leads there."
             )
-            said = f"poses of {vehicle}, east, north and up, by {topic.name} and {found.poses[1].name}{lacking}"
-        else:
-            table = self._poses.table
-            times_s, poses = table[:, 0], matrices(table)
-            of = self._child or f"{vehicle} (the topic does not name it)"
-            said = f"poses of {of} in {self._world or 'a frame without name'}, by {topic.name}"
-            onward = mounting(fixed, vehicle, self._child) if self._child else np.eye(4)
-            if onward is None:
-                raise InputError(
-                    f"--vehicle {vehicle}: the poses of {topic.name} are of {self._child}, and no mounting leads there."
-                )
-            poses = poses @ onward if len(poses) else poses
-        if broken := self._poses.broken + self._turns.broken:
-            say(self._console, f"{topic.name}: left out {broken} messages without a pose.", "yellow")
-        if len(times_s) < 2:
-            say(
-                self._console,
-                f"{topic.name}: has {len(times_s)} poses; at least two are needed. None are written.",
-                "yellow",
-            )
-            return None
-        write_text(self._output / _POSES, tum_text(times_s, poses))
-        return said
+        of = child or f"{vehicle} (the topic does not name it)"
+        poses = matrices(table)
+        said = f"poses of {of} in {world or 'a frame without name'}, by {topic.name}"
+        return table[:, 0], poses @ onward if len(poses) else poses, said
 
 
 def _write_scan(message: Any, scanner: FoundScanner, stamp_ns: int, path: Path) -> None:

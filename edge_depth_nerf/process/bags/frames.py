@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from edge_depth_nerf.cameras.transforms import Transform, rigid
@@ -26,6 +27,8 @@ _UNIT = 1e-2
 """How far the length of a quaternion may be from 1; they are brought to 1."""
 _SAME = 1e-6
 """A transform that never changes by more, in metres and in the quaternion's parts, is a mounting."""
+_MOST_GAP_S = 2.5
+"""Fixes that are farther apart are not joined."""
 _A, _E2 = 6378137.0, 6.69437999014e-3
 """WGS 84: the earth's larger radius, and its eccentricity squared."""
 
@@ -46,7 +49,13 @@ class Poses:
 
     def add(self, time_ns: int, place: Any, turn: Any) -> None:
         """Append a pose of a position and a quaternion of ROS."""
-        numbers = (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
+        self._append(time_ns, (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
+
+    def add_place(self, time_ns: int, *place: float) -> None:
+        """Append three numbers, with no turn."""
+        self._append(time_ns, (*place, 0.0, 0.0, 0.0, 1.0))
+
+    def _append(self, time_ns: int, numbers: tuple[float, ...]) -> None:
         length = float(np.linalg.norm(numbers[3:]))
         if not (np.isfinite(numbers).all() and abs(length - 1) <= _UNIT):
             self.broken += 1
@@ -122,7 +131,8 @@ def by_satellite(
 ) -> tuple[Float64[np.ndarray, "poses"], Float64[np.ndarray, "poses 4 4"]]:
     """The vehicle's poses by satellite fixes and the IMU's orientations, in a world of east, north and up.
 
-    Its origin is the first fix, on the ellipsoid of WGS 84.
+    Its origin is the first fix, on the ellipsoid of WGS 84. There is a pose for each fix and each orientation. Between
+    fixes the antenna follows a spline, as they may be a second apart; there are no poses where fixes are missing.
 
     Args:
         fixes: time (s), latitude and longitude (degrees), altitude (m) of the antenna.
@@ -130,22 +140,39 @@ def by_satellite(
         antenna_to_vehicle: where the antenna is.
         imu_to_vehicle: where the IMU is.
     """
-    fixes = fixes[(fixes[:, 0] >= turns[0, 0]) & (fixes[:, 0] <= turns[-1, 0])]
-    if not len(fixes):
+    if len(turns) > 1:
+        fixes = fixes[(fixes[:, 0] >= turns[0, 0]) & (fixes[:, 0] <= turns[-1, 0])]
+    runs = np.split(fixes, np.flatnonzero(np.diff(fixes[:, 0]) > _MOST_GAP_S) + 1)
+    runs = [run for run in runs if len(run) > 1]
+    if len(turns) < 2 or not runs:
         return np.empty(0), np.empty((0, 4, 4))
+    axes = _east_north_up(*np.radians(runs[0][0, 1:3]))
+    origin, times, places = _on_earth(runs[0][:1]), [], []
+    for run in runs:
+        inside = turns[(turns[:, 0] >= run[0, 0]) & (turns[:, 0] <= run[-1, 0]), 0]
+        times.append(np.union1d(inside, run[:, 0]))
+        places.append(CubicSpline(run[:, 0], (_on_earth(run) - origin) @ axes.T)(times[-1]))
+    times_s = np.concatenate(times)
+    imu_to_world = Slerp(turns[:, 0], Rotation.from_quat(turns[:, 1:]))(times_s).as_matrix()
+    turn = imu_to_world @ imu_to_vehicle[:3, :3].T
+    return times_s, rigid(turn, np.concatenate(places) - turn @ antenna_to_vehicle[:3, 3])
+
+
+def _on_earth(fixes: Float64[np.ndarray, "fixes 4"]) -> Float64[np.ndarray, "fixes 3"]:
+    """Fixes in metres from the earth's centre."""
     latitude, longitude = np.radians(fixes[:, 1]), np.radians(fixes[:, 2])
     radius = _A / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
     flat = (radius + fixes[:, 3]) * np.cos(latitude)
     up_axis = (radius * (1 - _E2) + fixes[:, 3]) * np.sin(latitude)
-    earth = np.stack((flat * np.cos(longitude), flat * np.sin(longitude), up_axis), -1)
-    lat, lon = latitude[0], longitude[0]
-    axes = np.array(
+    return np.stack((flat * np.cos(longitude), flat * np.sin(longitude), up_axis), -1)
+
+
+def _east_north_up(lat: float, lon: float) -> Float64[np.ndarray, "3 3"]:
+    """These directions at a place (radians), a row each, in the earth's frame."""
+    return np.array(
         [
             [-np.sin(lon), np.cos(lon), 0],
             [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
             [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
         ]
     )
-    imu_to_world = Slerp(turns[:, 0], Rotation.from_quat(turns[:, 1:]))(fixes[:, 0]).as_matrix()
-    turn = imu_to_world @ imu_to_vehicle[:3, :3].T
-    return fixes[:, 0], rigid(turn, (earth - earth[0]) @ axes.T - turn @ antenna_to_vehicle[:3, 3])

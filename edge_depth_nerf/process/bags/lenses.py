@@ -12,8 +12,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float64
 from numpy.typing import NDArray
+
+from edge_depth_nerf.cameras.transforms import Transform, rigid
 
 WORST_FIT_PX = 0.5
 """A model that is farther from the calibration (rms) is not used."""
@@ -30,8 +31,8 @@ class Lens:
     """A camera's model and numbers, by the keys of rig.toml."""
 
     keys: dict[str, str | int | float]
-    rotation: Float64[np.ndarray, "3 3"]
-    """From the camera's frame to that of its rectified pictures; the identity for others."""
+    to_frame: Transform
+    """From its pictures' frame to the camera's frame: another one if they are rectified."""
     note: str = ""
     """What the user should know."""
 
@@ -41,20 +42,29 @@ def _field(info: Any, name: str) -> NDArray[np.float64]:
     return np.array(getattr(info, name, None) if hasattr(info, name) else getattr(info, name.upper()), np.float64)
 
 
-def lens_of(info: Any, width: int, height: int, rectified: bool) -> Lens | str:
-    """A lens for pictures of this size, or why there is none."""
+def lens_of(info: Any, width: int, height: int, rectified: bool, shares_frame: bool) -> Lens | str:
+    """A lens for pictures of this size, or why there is none.
+
+    `shares_frame`: other cameras have the same frame. Of a stereo pair it is the left one's, by ROS, and the fourth
+    column of the right one's P says where that is.
+    """
     matrix = _field(info, "k").reshape(3, 3)
-    rotation = np.eye(3)
+    rotation, place = np.eye(3), np.zeros(3)
     distortion = _field(info, "d")
     model = info.distortion_model
     if rectified:
-        matrix = _field(info, "p").reshape(3, 4)[:, :3]
+        matrix, column = np.split(_field(info, "p").reshape(3, 4), [3], axis=1)
         given = _field(info, "r").reshape(3, 3)
         rotation = given if np.allclose(given @ given.T, np.eye(3), atol=1e-3) else rotation
         distortion, model = np.zeros(0), ""
     if not (np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
         return "its CameraInfo is not calibrated (fx is 0)"
-    scale, note = np.array([1.0, 1.0]), ""
+    scale, notes = np.array([1.0, 1.0]), []
+    if rectified and shares_frame and np.any(column[:2]):
+        place[:2] = -column[:2, 0] / (matrix[0, 0], matrix[1, 1])
+        notes += [
+            f"{np.linalg.norm(place):.4g} m from the origin of its frame, by P: another camera has this frame, too"
+        ]
     shift = np.array([info.roi.x_offset, info.roi.y_offset], np.float64)
     whole = np.array([info.width, info.height], np.float64)
     part = np.array([info.roi.width, info.roi.height], np.float64) if info.roi.width else whole
@@ -66,9 +76,10 @@ def lens_of(info: Any, width: int, height: int, rectified: bool) -> Lens | str:
         scale = 1 / np.maximum([info.binning_x, info.binning_y], 1).astype(np.float64)
     elif part.all() and abs(size[0] * part[1] / (size[1] * part[0]) - 1) < 0.01:
         scale = size / part
-        note = f"CameraInfo is of {part[0]:g}×{part[1]:g} px and was scaled to the pictures"
+        notes += [f"CameraInfo is of {part[0]:g}×{part[1]:g} px and was scaled to the pictures"]
     elif part.all():
         return f"its CameraInfo is of {part[0]:g}×{part[1]:g} px, its pictures of {width}×{height} px"
+    to_frame = rigid(rotation.T, rotation.T @ place)
     keys: dict[str, str | int | float] = {
         "model": "pinhole",
         "width": width,
@@ -82,17 +93,17 @@ def lens_of(info: Any, width: int, height: int, rectified: bool) -> Lens | str:
     if model in _EQUIDISTANT:
         keys["model"] = "kannala-brandt"
         keys |= _named(("k1", "k2", "k3", "k4"), distortion[:4])
-        return Lens(keys, rotation, note)
+        return Lens(keys, to_frame, "; ".join(notes))
     if model not in _PLUMB_BOB:
         return f"its distortion model {model!r} is not known"
     if len(distortion) <= 5 or not np.any(distortion[5:]):
         keys |= _named(("k1", "k2", "p1", "p2", "k3"), distortion[:5])
-        return Lens(keys, rotation, note)
+        return Lens(keys, to_frame, "; ".join(notes))
     fitted, rms_px, name = _fitted(keys, distortion)
     if rms_px > WORST_FIT_PX:
         return f"its distortion {model} has no equal here (the best, {name}, is {rms_px:.2f} px off, rms)"
-    said = f"fitted to {model}, {rms_px:.3f} px rms"
-    return Lens({**keys, **fitted}, rotation, f"{note}; {said}" if note else said)
+    notes += [f"fitted to {model}, {rms_px:.3f} px rms"]
+    return Lens({**keys, **fitted}, to_frame, "; ".join(notes))
 
 
 def _named(names: tuple[str, ...], values: NDArray) -> dict[str, float]:

@@ -6,7 +6,8 @@ two rows, from the upper left: rggb has red first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +61,11 @@ def why_no_picture(message: Any) -> str | None:
     return f"of encoding {encoding or '(empty)'}, which is not known"
 
 
-def bits_used(messages: Iterable[Any]) -> int:
-    """How many bits the brightest pixel of some raw pictures needs: 8, 10, 12, 14 or 16."""
-    brightest = max((int(_samples(each).max(initial=0)) for each in messages if _depth(each) == 16), default=0)
+def bits_used(message: Any) -> int:
+    """How many bits the brightest pixel of a picture needs: 8, 10, 12, 14 or 16; 8 if it is broken."""
+    brightest = 0
+    with suppress(InputError):
+        brightest = int(_samples(message).max(initial=0)) if _depth(message) == 16 else 0
     return next(bits for bits in (8, 10, 12, 14, 16) if brightest < 1 << bits)
 
 

@@ -27,7 +27,9 @@ def rig_text(
     """
     lines = [f"# Made by `edge-depth-nerf unpack` from {bag}. docs/rig.md explains each key.", ""]
     if poses is None:
-        lines += ["# The bag has no poses. Add a table [poses], or compute them: --poses lidar or --poses colmap."]
+        lines += [
+            "# The vehicle's poses were not found. Add [poses], or compute them: --poses lidar or --poses colmap."
+        ]
     else:
         lines += [f"# {poses}", "[poses]", 'file = "poses.txt"', 'format = "tum"']
     for camera, to_vehicle in cameras:

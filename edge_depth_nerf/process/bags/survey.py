@@ -43,6 +43,8 @@ _GENERIC = {
 """Parts of topics that name no sensor."""
 _PEEKED = 6
 """So many scans and pictures are read to see what they are."""
+_SPREAD = 16
+"""So many pictures, of all the time taken, tell how many of their bits are used: the first ones may be of a garage."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,8 @@ class Survey:
     scanners: list[FoundScanner] = field(default_factory=list)
     mountings: dict[Edge, Transform] = field(default_factory=dict)
     """Of /tf_static."""
-    poses: tuple[Topic, ...] = ()
-    """Of one source: poses, /tf, or fixes with an IMU."""
+    poses: list[tuple[Topic, ...]] = field(default_factory=list)
+    """Sources, the first ones first: poses, /tf, or fixes with an IMU."""
     taken: dict[str, str] = field(default_factory=dict)
     """By topic: what it is taken for, or why it is not."""
 
@@ -193,30 +195,45 @@ def _find_cameras(bag: Bag, options: UnpackOptions, found: Survey, by_type: dict
         groups.setdefault(key, []).append(topic)
     chosen = []
     for group in groups.values():
-        best = min(group, key=lambda topic: ("rect" in topic.name, "mono" in topic.name, topic.type == COMPRESSED))
+        best = min(group, key=lambda topic: (_rectified(topic), "mono" in topic.name, topic.type == COMPRESSED))
         chosen.append(best)
         for other in group:
             if other != best:
                 found.taken[other.name] = f"nothing: the same camera as {best.name}; --topics chooses"
     used: dict[str, list[str]] = {topic.name: [] for topic, _ in infos}
+    frames = {topic: name_of(peeked[topic.name][0][1].header.frame_id) for topic in chosen}
     for topic, name in _named(chosen, set()):
-        messages = peeked[topic.name]
-        first = messages[0][1]
+        first = peeked[topic.name][0][1]
         try:
             width, height = size_of(first)
         except InputError as error:
             raise InputError(f"{bag.path}: the first picture of {topic.name} has {error}.") from None
-        frame = name_of(first.header.frame_id)
+        frame = frames[topic]
         info = _info_of(topic.name, frame, infos)
         lens: Lens | str = "the bag has no CameraInfo for it"
         if info is not None:
             used[info[0].name].append(name)
-            lens = lens_of(info[1], width, height, "rect" in topic.name)
-        bits = bits_used(message for _, message in messages)
+            shares_frame = list(frames.values()).count(frame) > 1
+            lens = lens_of(info[1], width, height, _rectified(topic), shares_frame)
+        bits = _bits_of(bag, options, topic)
         found.cameras.append(FoundCamera(topic, name, frame, width, height, bits, lens))
         found.taken[topic.name] = f"pictures of {name}"
     for info_topic, names in used.items():
         found.taken[info_topic] = f"calibration of {', '.join(names)}" if names else "calibration, of no camera taken"
+
+
+def _rectified(topic: Topic) -> bool:
+    return re.search(r"(?<![a-z])rect(ified)?(?![a-z])", topic.name.lower()) is not None
+
+
+def _bits_of(bag: Bag, options: UnpackOptions, topic: Topic) -> int:
+    """How many bits of a topic's pictures are used."""
+    if topic.type != IMAGE:
+        return 8
+    start_ns, end_ns = window(bag, options)
+    times = (start_ns + (end_ns - start_ns) * number // _SPREAD for number in range(_SPREAD))
+    firsts = (next(bag.messages([topic.name], time_ns, end_ns), None) for time_ns in times)
+    return max((bits_used(each[2]) for each in firsts if each is not None), default=8)
 
 
 def _info_of(topic: str, frame: str, infos: list[tuple[Topic, Any]]) -> tuple[Topic, Any] | None:
@@ -324,12 +341,10 @@ def _find_poses(options: UnpackOptions, found: Survey, by_type: dict[str, list[T
     for topic in by_type.get(FIX, []):
         if not imus:
             found.taken[topic.name] = "nothing: fixes have no orientation, and there is no Imu"
-    if not sources:
-        return
-    found.poses = sources[0]
-    for topic in found.poses:
-        also = f", {found.taken[topic.name]}" if topic.type == TF else ""
-        found.taken[topic.name] = f"poses{also}"
-    for topic, *_ in sources[1:]:
-        if not found.taken[topic.name].startswith("mount"):
-            found.taken[topic.name] = f"nothing: poses are of {found.poses[0].name}; --poses chooses"
+    found.poses = sources
+    for source in sources:
+        role = "poses" if source is sources[0] else f"poses, if {sources[0][0].name} has none; --poses chooses"
+        for topic in source:
+            # the same Imu for all fixes
+            if not found.taken[topic.name].startswith("poses"):
+                found.taken[topic.name] = f"{role}, {found.taken[topic.name]}" if topic.type == TF else role
