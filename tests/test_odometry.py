@@ -22,6 +22,7 @@ from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.breaks import find_break
 from edge_depth_nerf.poses.odometry import TimedSweep, odometry, steps_of
 from edge_depth_nerf.poses.path_agreement import PATHS_AGREE, compare_paths, read_agreement, write_agreement
+from edge_depth_nerf.process import lidar_poses as lidar_poses_module
 from edge_depth_nerf.process import pose_checks
 from edge_depth_nerf.process.build import process_recording
 from edge_depth_nerf.process.converters import read_drive
@@ -39,7 +40,6 @@ from edge_depth_nerf.synthetic.rig import VELO_TO_POSE
 from edge_depth_nerf.synthetic.scenes import build_scene
 
 QUIET = Console(quiet=True)
-OPTIONS = ProcessOptions(output=Path("scene"), poses="lidar")
 TURN_S = 0.1
 FRAMES = 14
 SCANNERS = {
@@ -49,6 +49,11 @@ SCANNERS = {
 """By their rings."""
 
 Poses = Callable[[np.ndarray], np.ndarray]
+
+
+@pytest.fixture
+def options(tmp_path: Path) -> ProcessOptions:
+    return ProcessOptions(output=tmp_path / "scene", poses="lidar")
 
 
 class Motion(Drive):
@@ -89,7 +94,7 @@ def scanned(scene: str, frames: int, rings: int = 32, motion: str = "drive") -> 
         taken = sweep(world, Motion(poses), time_s, np.random.default_rng(frame), SCANNERS[rings])
         points = torch.from_numpy(taken.raw.astype(np.float64))
         read = Sweep(points[:, :3], points[:, 3], 0, 0)
-        where = (Path(f"lidar/{frame}.bin"), time_s, frame, "roof", VELO_TO_POSE)
+        where = (Path(__file__), time_s, frame, "roof", VELO_TO_POSE)
         sweeps.append(RecordedSweep(*where, lambda read=read: read, SweepTiming(TURN_S)))
     lens = Pinhole(64, 48, 40.0, 40.0, 32.0, 24.0)
     to_vehicle = np.eye(4)
@@ -111,10 +116,10 @@ def errors(path: Trajectory, poses: Poses) -> tuple[np.ndarray, np.ndarray, floa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("motion", ["drive", "bends"])
-def test_the_path_is_right_from_the_first_step(motion):
+def test_the_path_is_right_from_the_first_step(motion, options):
     pytest.importorskip("kiss_icp")
     recording, poses = scanned("street", FRAMES, motion=motion)
-    found = lidar_poses(recording, OPTIONS, QUIET)
+    found = lidar_poses(recording, options, QUIET)
     assert found.trajectory is not None
     apart, steps, length_m = errors(found.trajectory, poses)
     # of a sixth of a real scanner's returns, on 8 to 11 m
@@ -155,32 +160,32 @@ def points_of(recorded: RecordedSweep) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kept", "share"), [(10, 0.01), (5, 0.02)])
-def test_few_sweeps_are_enough(kept, share):
+def test_few_sweeps_are_enough(kept, share, options):
     pytest.importorskip("kiss_icp")
     recording, poses = scanned("street", FRAMES)
     few = dataclasses.replace(recording, sweeps=recording.sweeps[:kept], pictures=recording.pictures[:kept])
-    found = lidar_poses(few, OPTIONS, QUIET)
+    found = lidar_poses(few, options, QUIET)
     assert found.trajectory is not None
     apart, _, length_m = errors(found.trajectory, poses)
     assert apart.max() < max(share * length_m, 0.05)
 
 
 @pytest.mark.slow
-def test_sixteen_rings_are_enough_on_a_street():
+def test_sixteen_rings_are_enough_on_a_street(options):
     pytest.importorskip("kiss_icp")
     recording, poses = scanned("street", FRAMES, rings=16)
-    found = lidar_poses(recording, OPTIONS, QUIET)
+    found = lidar_poses(recording, options, QUIET)
     assert found.trajectory is not None
     apart, _, length_m = errors(found.trajectory, poses)
     assert apart[-1] < 0.01 * length_m
 
 
 @pytest.mark.slow
-def test_pictures_away_from_the_sweeps_are_listed():
+def test_pictures_away_from_the_sweeps_are_listed(options):
     pytest.importorskip("kiss_icp")
     recording, _ = scanned("street", FRAMES)
     short = dataclasses.replace(recording, sweeps=recording.sweeps[:8])
-    found = lidar_poses(short, OPTIONS, QUIET)
+    found = lidar_poses(short, options, QUIET)
     assert [picture.frame for picture in found.pictures] == list(range(8)) and len(found.skipped) == FRAMES - 8
     # the last sweep's turn reaches half a frame further
     assert found.skipped[-1].frame == FRAMES - 1 and found.skipped[-1].reason == "no sweep near it in time"
@@ -209,7 +214,11 @@ def test_a_drive_without_poses_becomes_a_scene(tmp_path, monkeypatch):
     )
     without_lidar_check(monkeypatch)
     report = process_recording(read_drive(blind), blind, QUIET)
-    notices = " ".join(report.notices)
+    # the path is kept for the next run
+    monkeypatch.setattr(lidar_poses_module, "path_of", None)
+    again = process_recording(read_drive(blind), blind, QUIET).notices
+    assert set(again) <= set(report.notices)
+    notices = " ".join(again)
     # every sweep is followed, not only those of the frames asked for: 0.6 s at some 4 m/s
     length = re.search(r"followed 7 sweeps of \w+: the path is ([0-9.]+) m long", notices)
     assert length is not None and 2.2 < float(length[1]) < 2.7
@@ -274,11 +283,11 @@ def test_a_path_from_pictures_is_held_against_lidar(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("motion", "message"), [("stands", "stands still"), ("turns", r"turns on the spot, by \d+°")])
-def test_a_vehicle_that_goes_nowhere_has_no_path(motion, message):
+def test_a_vehicle_that_goes_nowhere_has_no_path(motion, message, options):
     pytest.importorskip("kiss_icp")
     recording, _ = scanned("parking", 8, motion=motion)
     with pytest.raises(InputError, match=rf"--poses lidar: the vehicle {message}.*Use frames of a stretch"):
-        lidar_poses(recording, OPTIONS, QUIET)
+        lidar_poses(recording, options, QUIET)
 
 
 def test_a_missing_package_is_named_with_the_command(monkeypatch):

@@ -13,7 +13,7 @@ PACKAGE = ROOT / "edge_depth_nerf"
 
 MOST_LINES = {
     "edge_depth_nerf": 685,
-    "edge_depth_nerf/base": 1_575,
+    "edge_depth_nerf/base": 1_580,
     "edge_depth_nerf/cameras": 1_325,
     "edge_depth_nerf/compare": 2_875,
     "edge_depth_nerf/demo": 330,
@@ -29,9 +29,9 @@ MOST_LINES = {
     "edge_depth_nerf/plugin": 4_945,
     "edge_depth_nerf/plugin/fused": 685,
     "edge_depth_nerf/poses": 760,
-    "edge_depth_nerf/process": 5_601,
+    "edge_depth_nerf/process": 5_625,
     "edge_depth_nerf/process/bags": 1_760,
-    "edge_depth_nerf/process/colmap": 1_610,
+    "edge_depth_nerf/process/colmap": 1_605,
     "edge_depth_nerf/process/kitti": 365,
     "edge_depth_nerf/process/kitti360": 550,
     "edge_depth_nerf/report": 750,

@@ -149,6 +149,12 @@ def write_text(path: Path, content: str) -> None:
     write_bytes(path, content.encode())
 
 
+def file_stamp(path: Path) -> list[Any]:
+    """What tells a file from another version of it, wherever its folder lies: names, size and time of change."""
+    found = path.stat()
+    return [path.parent.name, path.name, found.st_size, found.st_mtime_ns]
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write JSON atomically, indented; NaN and infinity are refused."""
     write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")

@@ -7,6 +7,8 @@ sweep of the stretch is used, those between the chosen frames included.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 import math
 import statistics
 from collections import defaultdict
@@ -21,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.files import file_stamp, read_json, write_json
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.lidar import transform_points
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
@@ -44,6 +47,8 @@ _FEW_POINTS = 5000
 def lidar_poses(recording: Recording, options: ProcessOptions, console: Console) -> Recording:
     """Find the poses of a recording's pictures by LiDAR odometry, from its sweeps and its rig alone.
 
+    The path is kept in the scene for the next run.
+
     Returns:
         The recording with the vehicle's path, and with the pictures that were taken between its sweeps, or within
         half a turn of them; the others are listed in `skipped`. A notice says how long the path is.
@@ -52,8 +57,8 @@ def lidar_poses(recording: Recording, options: ProcessOptions, console: Console)
         InputError: KISS-ICP is not installed, there are too few sweeps or a gap between them, a sweep cannot be
             read, the vehicle stands or turns on the spot, or the path is none of a vehicle.
     """
-    sweeps = [sweep for sweep in check_sweeps(recording) if options.strict or read_if_whole(sweep.read) is not None]
-    trajectory = upright(recording, path_of(sweeps, console))
+    sweeps = check_sweeps(recording)
+    trajectory = upright(recording, _followed(sweeps, options, console))
     _check_path(trajectory)
     slack_s = statistics.median(np.diff(trajectory.times_s).tolist())
 
@@ -67,6 +72,21 @@ def lidar_poses(recording: Recording, options: ProcessOptions, console: Console)
             f"{sweeps[0].scanner}. Check the times of pictures and sweeps"
         )
     return dataclasses.replace(posed, notices=(*posed.notices, *_notices(sweeps, trajectory)))
+
+
+def _followed(sweeps: Sequence[RecordedSweep], options: ProcessOptions, console: Console) -> Trajectory:
+    """The path of these sweeps, without --strict of those that can be read; it may be that of an earlier run."""
+    what = [[*file_stamp(s.path), s.time_s, s.to_vehicle.tolist(), s.columns, repr(s.timing)] for s in sweeps]
+    digest = hashlib.sha256(json.dumps([import_kiss_icp().__version__, options.strict, what]).encode()).hexdigest()
+    path = options.output / ".cache" / "odometry.json"
+    found = read_json(path) if path.is_file() else {}
+    if found.get("digest") == digest:
+        return Trajectory(np.array(found["times_s"]), np.array(found["vehicle_to_world"]))
+    whole = [sweep for sweep in sweeps if options.strict or read_if_whole(sweep.read) is not None]
+    followed = path_of(whole, console)
+    arrays = {"times_s": followed.times_s.tolist(), "vehicle_to_world": followed.vehicle_to_world.tolist()}
+    write_json(path, {"digest": digest, **arrays})
+    return followed
 
 
 def check_sweeps(recording: Recording) -> list[RecordedSweep]:
@@ -165,10 +185,11 @@ def _notices(sweeps: Sequence[RecordedSweep], trajectory: Trajectory) -> list[st
         trajectory.times_s
     )
     notices = [
-        f"LiDAR odometry followed {len(sweeps)} sweeps of {sweeps[0].scanner}: the path is "
+        f"LiDAR odometry followed {len(trajectory.times_s)} sweeps of {sweeps[0].scanner}: the path is "
         f"{path_length_m(trajectory):.1f} m long, at {np.median(speed):.1f} m/s (median), {speed.max():.1f} at most."
     ]
-    if sweeps[0].timing is None and sweeps[0].read().offset_s is None:
+    first = read_if_whole(sweeps[0].read)
+    if sweeps[0].timing is None and first is not None and first.offset_s is None:
         notices.append(
             f"The sweeps of {sweeps[0].scanner} have no times, so they count as already corrected for the vehicle's "
             "motion. If they are raw, give turn_s and direction, or point_times."

@@ -199,12 +199,6 @@ def find_models(recording: Recording, options: ProcessOptions, folder: Path, con
     return run.read_models(run.models)
 
 
-def file_stamp(path: Path) -> list:
-    """What tells a file from another version of it, wherever the drive lies: names, size and time of change."""
-    found = path.stat()
-    return [path.parent.name, path.name, found.st_size, found.st_mtime_ns]
-
-
 def shared_views(recording: Recording, lenses: Mapping[str, ColmapLens]) -> set[tuple[str, str]]:
     """Pairs of cameras, in the recording's order, whose pictures overlap enough to be matched with each other."""
     shared = set()

@@ -24,13 +24,13 @@ from jaxtyping import Bool, Float64, Int
 from rich.console import Console
 
 from edge_depth_nerf.base.console import progress_bars
-from edge_depth_nerf.base.files import read_image, read_json, sha256_of, write_json
+from edge_depth_nerf.base.files import file_stamp, read_image, read_json, sha256_of, write_json
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.poses.matches import Matches, epipolar_distance_px, match_pictures
 from edge_depth_nerf.poses.tracks import Tracks, features_joined, join_matches, reprojection_px, spread, triangulate
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, adjust_bundle
-from edge_depth_nerf.process.colmap.models import colmap_lenses, file_stamp, import_pycolmap, pairs_to_match
+from edge_depth_nerf.process.colmap.models import colmap_lenses, import_pycolmap, pairs_to_match
 from edge_depth_nerf.process.colmap.scale import frame_times
 from edge_depth_nerf.process.feature_masks import FeatureMasks, posed_pictures
 from edge_depth_nerf.process.options import ProcessOptions
