@@ -31,7 +31,9 @@ def build(small: bool = True, **options) -> EdgeDepthNerfModel:
     camera_optimizer = replace(config.camera_optimizer, mode=options.pop("poses", "off"))
     config = replace(config, camera_optimizer=camera_optimizer, **options)
     box = SceneBox(aabb=torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
-    return config.setup(scene_box=box, num_train_data=3, metadata={"metres_per_unit": 20.0}, device=device)
+    return config.setup(
+        scene_box=box, num_train_data=3, metadata={"metres_per_unit": 20.0, "frames": [0, 1, 2]}, device=device
+    )
 
 
 def pipeline_config(scene: Path, poses: str = "off", **model: Any) -> Any:

@@ -1,16 +1,20 @@
+from collections import Counter
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from scenes import fisheye, pinhole, transforms, write_scene
+from scenes import SAMPLE_DRIVE, fisheye, pinhole, transforms, write_scene
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_distance_png, write_mask, write_png
 from edge_depth_nerf.cameras import Pinhole
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, default_metres_per_unit
 from edge_depth_nerf.plugin.dataset import FisheyeDepthDataset
+from edge_depth_nerf.plugin.pose_refinement import FRAMES, PoseRefinerConfig
 
 
 def parse(folder, split="train", **options):
@@ -43,6 +47,33 @@ def test_positions_are_metres_over_metres_per_unit(shared):
     for layer in ("image", "lidar", "mono", "truth_distance", "truth_rgb"):
         assert [picture.files[layer].name for picture in outputs.metadata["pictures"]] == names
     assert len(parse(shared, "test").image_filenames) == 1
+
+
+def test_both_cameras_of_a_frame_share_its_pose_adjustment():
+    outputs = parse(SAMPLE_DRIVE)
+    assert [*Counter(outputs.metadata[FRAMES]).values()] == [2] * 11
+    optimizer = PoseRefinerConfig(mode="SO3xR3").setup(num_cameras=22, device="cpu")
+    optimizer.settle(outputs.metadata[FRAMES], outputs.metadata["metres_per_unit"])
+    assert optimizer.pose_adjustment.shape == (11, 6)
+
+
+def test_folders_of_other_peoples_splits_are_no_cameras(tmp_path):
+    """As nerfstudio's own data sets have them: nothing tells which of their pictures were taken together."""
+    folder = write_scene(tmp_path)
+    with transforms(folder) as meta:
+        for frame in meta["frames"]:
+            del frame["lidar_file_path"]
+            split = "train" if frame["file_path"] in meta["train_filenames"] else "test"
+            moved = Path("images", split, Path(frame["file_path"]).name)
+            (folder / moved).parent.mkdir(parents=True, exist_ok=True)
+            (folder / frame["file_path"]).rename(folder / moved)
+            for names in (meta["train_filenames"], meta["val_filenames"], meta["test_filenames"]):
+                names[:] = [str(moved) if name == frame["file_path"] else name for name in names]
+            frame["file_path"] = str(moved)
+    held_out = FisheyeDepthDataset(parse(folder, "test"))
+    assert not held_out.of_held_out_cameras and "lidar_distance_m" in held_out[0]
+    of_training = parse(folder).metadata[FRAMES]
+    assert len({*of_training, *(picture.frame for picture in held_out.pictures)}) == len(of_training) + len(held_out)
 
 
 BENT = Pinhole(32, 28, 20.0, 20.5, 16.0, 14.0, 0.01, 0.02, 1e-3, 2e-3, 0.03, 0.01)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.plugin.compat import without_undefined_ray
+from edge_depth_nerf.plugin.pose_refinement import FRAMES
 from edge_depth_nerf.plugin.scanning import SceneToModel
 from edge_depth_nerf.scene.format import DepthKind, read_transforms
 from edge_depth_nerf.scene.reader import scene_of
@@ -193,9 +194,9 @@ class FisheyeDepth(Nerfstudio):
             scene=scene,
             pictures=pictures,
             metres_per_unit=metres_per_unit,
-            of_split=[picture.frame for picture in pictures],
             depth_unit_scale_factor=scene.lidar_metres_per_count,
         )
+        outputs.metadata[FRAMES] = [picture.frame for picture in pictures]
         for file in dict.fromkeys(file for picture in pictures for file in picture.files.values()):
             if not file.is_file():
                 raise FileNotFoundError(f"{file}: no such file, but {path} names it. Process the drive again.")

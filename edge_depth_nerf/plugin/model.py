@@ -205,8 +205,7 @@ class EdgeDepthNerfModel(NerfactoModel):
     def _refine_poses(self, metadata: dict[str, Any]) -> None:
         """Let poses be learned from what the field shows, not from where the proposals put their samples."""
         if isinstance(self.camera_optimizer, PoseRefiner):
-            frames = metadata.get(FRAMES, list(range(self.num_train_data)))
-            self.camera_optimizer.settle(frames, self.metres_per_unit)
+            self.camera_optimizer.settle(metadata[FRAMES], self.metres_per_unit)
         self.density_fns = [without_gradient_to_positions(density_fn) for density_fn in self.density_fns]
 
     def _set_renderers(self) -> None:

@@ -61,7 +61,7 @@ class ScenePicture:
     camera: str
     """The frame's own word, or the folder of its pictures."""
     frame: int
-    """Number of the frame in the drive; in other people's scenes its place in the order of names."""
+    """Number of the frame in the drive; in other people's scenes the picture's place in the order of names."""
     lens: KannalaBrandt | Pinhole
     """The camera that nerfstudio sees."""
     position_m: Float64[np.ndarray, "3"]
@@ -181,9 +181,9 @@ class SceneFolder:
         return {name: tuple(picture for picture in self.pictures if picture.camera == name) for name in names}
 
     def held_out_cameras(self) -> set[str]:
-        """The cameras none of whose pictures is for training."""
-        every = self.cameras().items()
-        return {name for name, pictures in every if self.split_known and all(each.held_out for each in pictures)}
+        """The cameras none of whose pictures is for training; other people's scenes have folders, not cameras."""
+        every = self.cameras().items() if self.own and self.split_known else ()
+        return {name for name, pictures in every if all(each.held_out for each in pictures)}
 
     def checks(self) -> dict[str, Any]:
         """What `process` found when it held LiDAR, poses and masks against the pictures; empty if it did not."""
@@ -419,13 +419,10 @@ def _camera_name(frame: dict[str, Any]) -> str:
 
 
 def _frame_numbers(frames: list[dict[str, Any]]) -> dict[str, int]:
-    """The frame number of each picture: the given one, else its order within its camera."""
+    """The frame number of each picture: the given one, else its own, as nothing tells which were taken together."""
     if all("frame" in frame for frame in frames):
         return {frame["file_path"]: frame["frame"] for frame in frames}
-    ordered: dict[str, list[str]] = {}
-    for frame in sorted(frames, key=lambda frame: frame["file_path"]):
-        ordered.setdefault(_camera_name(frame), []).append(frame["file_path"])
-    return {name: number for names in ordered.values() for number, name in enumerate(names)}
+    return {name: number for number, name in enumerate(sorted(frame["file_path"] for frame in frames))}
 
 
 def _lens(meta: dict[str, Any], frame: dict[str, Any], model: str, path: Path) -> KannalaBrandt | Pinhole:

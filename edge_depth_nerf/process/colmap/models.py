@@ -37,7 +37,15 @@ from rich.console import Console
 
 from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_json, write_atomically, write_bytes, write_json, write_mask, write_text
+from edge_depth_nerf.base.files import (
+    file_stamp,
+    read_json,
+    write_atomically,
+    write_bytes,
+    write_json,
+    write_mask,
+    write_text,
+)
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole, fit_kannala_brandt
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.process.feature_masks import FeatureMasks
