@@ -28,6 +28,10 @@ from edge_depth_nerf.compare.options import SearchOptions
         ({"seeds": (1, 1)}, "--seeds 1 1: expected each once"),
         ({"methods": ("edge", "edge")}, "--methods edge edge"),
         ({"preset": "paper", "methods": ("edge-paper",)}, "expected edge, edge-lidar, .* of the literal method"),
+        *(
+            ({"preset": "paper", "methods": ("nerfacto", name)}, f"--preset paper --methods {name}: expected")
+            for name in ("ds-nerf-extras", "ds-nerf-integrated-extras", "edge-plain", "edge-sharp")
+        ),
         ({"jobs": 2, "cluster": "local"}, "--jobs with --cluster"),
         ({"methods": ("edge-lidr",)}, "edge-lidr: no such method. Is edge-lidar meant"),
         # a name leaves out what is usual

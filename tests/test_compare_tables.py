@@ -267,6 +267,14 @@ def test_runs_that_differ_in_unnamed_fields_are_refused(results):
         if run.method == "ds-nerf":
             run.content["named"], run.content["configuration"]["b"] = ["b"], "2"
     check_fair(results)
+    # what the first method names does not excuse two others that do not
+    first = results.runs[0].method
+    assert len({run.method for run in results.runs} - {first, "ds-nerf"}) == 1
+    for run in results.runs:
+        run.content["named"] = ["c"] if run.method == first else []
+        run.content["configuration"].update(b="2", c="3" if run.method == "ds-nerf" else "1")
+    with pytest.raises(InputError, match="its c is "):
+        check_fair(results)
 
 
 def test_edges_on_the_path_beside_it_and_from_a_held_out_camera():

@@ -15,7 +15,7 @@ MOST_LINES = {
     "edge_depth_nerf": 685,
     "edge_depth_nerf/base": 1_580,
     "edge_depth_nerf/cameras": 1_325,
-    "edge_depth_nerf/compare": 2_875,
+    "edge_depth_nerf/compare": 2_880,
     "edge_depth_nerf/demo": 330,
     "edge_depth_nerf/export": 970,
     "edge_depth_nerf/films": 1_785,

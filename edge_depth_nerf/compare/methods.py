@@ -82,6 +82,11 @@ class Method:
             return replace(self, prior="integrated", extras=self.variant != "paper")
         return replace(self, prior=None if self.loss == "none" else "lidar", extras=False)
 
+    @property
+    def differs_without_extras(self) -> bool:
+        """Whether it is another method than all others where a preset has no extras."""
+        return self.variant in ("", "embedding") and self.extras == self._usual.extras
+
     @cached_property
     def name(self) -> MethodName:
         """What the command line, folders and results call it."""

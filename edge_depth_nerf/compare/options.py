@@ -61,11 +61,13 @@ class TrainingOptions:
         _check_once("seeds", self.seeds)
         for name in self.methods:
             check_name(name)
-        literal = [name for name in self.methods if METHODS[name].variant == "paper"]
+        # they would be trained like others, and be called otherwise
+        same = [name for name in self.methods if not METHODS[name].differs_without_extras]
         require(
-            not literal or self.preset != "paper",
-            f"--preset paper --methods {_words(tuple(literal))}",
-            "edge, edge-lidar, edge-mono, edge-gaussian, which are of the literal method in this preset",
+            not same or self.preset != "paper",
+            f"--preset paper --methods {_words(tuple(same))}",
+            "edge, edge-lidar, edge-mono, edge-gaussian, which are of the literal method in this preset, and rivals "
+            "without -extras: it has none",
         )
 
 

@@ -157,13 +157,11 @@ def check_fair(results: Results) -> None:
     Raises:
         InputError: two runs differ otherwise: one is of another version of the program, or was tampered with.
     """
-    reference = results.runs[0]
-    of_method: dict[MethodName, RunResult] = {}
+    firsts: dict[MethodName, RunResult] = {}
     for run in results.runs:
-        first = of_method.setdefault(run.method, run)
-        for other, named in ((first, set()), (reference, {*run.content["named"], *reference.content["named"]})):
-            if other.method == run.method and named:
-                continue
+        first = firsts.setdefault(run.method, run)
+        for other in (first, *firsts.values()):
+            named = set() if other is first else {*run.content["named"], *other.content["named"]}
             ours, theirs = run.content["configuration"], other.content["configuration"]
             for name in sorted({*ours, *theirs} - named - {*OF_A_RUN}):
                 if ours.get(name) != theirs.get(name):
