@@ -76,6 +76,19 @@ def test_folders_of_other_peoples_splits_are_no_cameras(tmp_path):
     assert len({*of_training, *(picture.frame for picture in held_out.pictures)}) == len(of_training) + len(held_out)
 
 
+def test_lists_may_spell_names_otherwise(tmp_path):
+    folder = write_scene(tmp_path)
+    with transforms(folder) as meta:
+        meta["train_filenames"] = [f"./{name}" for name in meta["train_filenames"]]
+    assert len(parse(folder).image_filenames) == 8
+
+
+def test_a_split_by_names_needs_such_names(tmp_path):
+    folder = write_scene(tmp_path, split=False)
+    with pytest.raises(InputError, match="--eval-mode filename needs names of pictures with train or eval in them"):
+        parse(folder, eval_mode="filename")
+
+
 BENT = Pinhole(32, 28, 20.0, 20.5, 16.0, 14.0, 0.01, 0.02, 1e-3, 2e-3, 0.03, 0.01)
 
 

@@ -1,13 +1,14 @@
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from models import pipeline_config, pipeline_of
-from scenes import write_scene
+from scenes import transforms, write_scene
 
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import write_distance_png
+from edge_depth_nerf.base.files import read_distance_png, write_distance_png
 from edge_depth_nerf.plugin.pipeline import NotFiniteError
 
 
@@ -25,6 +26,40 @@ def test_a_depth_loss_without_any_prior_is_an_error(tmp_path):
         pipeline_of(scene)
     pipeline = pipeline_of(scene, depth_loss="none")
     assert np.isfinite(float(pipeline.get_train_loss_dict(0)[1]["rgb_loss"].detach()))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (
+            {"near_m": 50.0, "far_m": 10.0},
+            r"near-m 50 and --pipeline\.model\.far-m 10: expected 0 or more",
+        ),
+        ({"near_m": -5.0}, r"near-m -5 and .*: expected 0 or more metres"),
+        ({"depth_loss_mult": -1.0}, r"--pipeline\.model\.depth-loss-mult -1: expected 0 or more"),
+        ({"depth_loss_sharp": math.nan}, r"--pipeline\.model\.depth-loss-sharp nan: expected 0 or more"),
+    ],
+)
+def test_options_out_of_range(shared, options, said):
+    with pytest.raises(InputError, match=said):
+        pipeline_of(shared, **options)
+
+
+def test_a_prior_in_another_unit_is_named(tmp_path):
+    """Maps in metres, read as nerfstudio's millimetres."""
+    scene = write_scene(tmp_path, mono=False, frames=3, depth_unit_scale_factor=1e-3)
+    with transforms(scene) as meta:
+        for frame in meta["frames"]:
+            counts = read_distance_png(scene / frame.pop("lidar_file_path"), 1 / 256)
+            frame["depth_file_path"] = f"{Path(frame['file_path']).stem}.npy"
+            np.save(scene / frame["depth_file_path"], counts.astype(np.float32))
+    with pytest.raises(
+        InputError, match=r"no depth prior is between .*0\.2 m.*their median.*--depth-unit-scale-factor 1"
+    ):
+        pipeline_of(scene)
+    config = pipeline_config(scene)
+    config.datamanager.dataparser.depth_unit_scale_factor = 1.0
+    assert config.setup(device="cpu", test_mode="val").get_train_loss_dict(0)[1]["edge_loss"] > 0
 
 
 def test_a_scene_without_depth_maps_is_trained_as_plain_nerfacto(tmp_path, capsys):

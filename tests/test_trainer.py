@@ -8,11 +8,13 @@ import os
 import re
 import shlex
 import signal
+from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.viewer.viewer import Viewer
@@ -25,9 +27,11 @@ from edge_depth_nerf.compare.options import CompareOptions
 from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.jobs.runs import newest_checkpoint
 from edge_depth_nerf.kernels.threads import kernel_threads
+from edge_depth_nerf.plugin.config import apply_overrides
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
 from edge_depth_nerf.plugin.model import EdgeDepthNerfModel
 from edge_depth_nerf.plugin.pipeline import EdgeDepthPipeline
+from edge_depth_nerf.plugin.settings import WITHOUT_EFFECT, check_effect, flattened
 from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 
 STEPS = 4
@@ -194,6 +198,28 @@ def test_a_relative_scene_is_said_to_be_relative(trainer, tmp_path, monkeypatch)
     trainer.config.pipeline.datamanager.data = Path("elsewhere")
     with pytest.raises(FileNotFoundError, match=f"searched in {tmp_path}: relative paths start at the current folder"):
         trainer.config.save_config()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("pipeline.model.near_plane", 1.0, "--pipeline.model.near-plane has no effect: use --pipeline.model.near-m"),
+        ("pipeline.datamanager.pixel_sampler.ignore_mask", True, "pixel-sampler.ignore-mask has no effect: leave it"),
+        ("pipeline.datamanager.patch_size", 4, "--pipeline.datamanager.patch-size has no effect: leave it out"),
+    ],
+)
+def test_settings_without_effect_are_refused(trainer, name, value, said):
+    config = deepcopy(all_methods["edge-depth-nerf-lite"])
+    config.pipeline.datamanager.data = trainer.config.pipeline.datamanager.data
+    check_effect(config._changed())
+    apply_overrides(config, {name: value}, "test")
+    with pytest.raises(InputError, match=said):
+        config.save_config()
+
+
+def test_settings_without_effect_are_there():
+    names = {*flattened(all_methods["edge-depth-nerf-lite"])}
+    assert [option for option in WITHOUT_EFFECT if not any(f"{name}.".startswith(f"{option}.") for name in names)] == []
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

@@ -7,7 +7,7 @@ in scene units times `metres_per_unit` is metres.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -73,7 +73,8 @@ class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig, SceneOptions):
     auto_scale_poses: tyro.conf.Suppress[bool] = False
     """nerfstudio's scaling of all poses into +-1. It is off: metres_per_unit sets the scale."""
     eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
-    """How a scene without split files is divided. interval holds out every eval_interval-th picture."""
+    """How a scene without split files is divided. interval holds out every eval_interval-th picture; filename those with
+    eval in their names, and train in the others'."""
 
 
 def check_split(meta: dict[str, Any], path: Path) -> None:
@@ -177,10 +178,14 @@ class FisheyeDepth(Nerfstudio):
         check_split(meta, path)
         self._check_config(meta, path, split)
         metres_per_unit = self._metres_per_unit(frames)
+        # nerfstudio's parser takes the scale from its config; the user's own stays
+        self.config = replace(self.config, scale_factor=1.0 / metres_per_unit)
         if len(frames) == 1 and "train_filenames" not in meta:
             self.config.eval_mode = "all"  # the one picture is for training and for evaluation
-        # nerfstudio's parser takes the scale from its config
-        self.config.scale_factor = 1.0 / metres_per_unit
+        names = [Path(frame["file_path"]).name for frame in frames]
+        by_name = self.config.eval_mode == "filename" and "train_filenames" not in meta
+        if by_name and not all("train" in name or "eval" in name for name in names):
+            raise InputError(f"{path}: --eval-mode filename needs names of pictures with train or eval in them.")
         outputs = super()._generate_dataparser_outputs(split)
         if not outputs.image_filenames:
             raise InputError(f"{path}: no picture is left for the split {split!r}; it needs one at least.")

@@ -6,6 +6,7 @@ the dataset's metadata, so that near, far, sigma and the loss weight mean the sa
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from copy import copy
@@ -26,6 +27,7 @@ from nerfstudio.models.nerfacto import NerfactoModel, NerfactoModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from edge_depth_nerf.base.errors import require
 from edge_depth_nerf.base.pictures import DISTANCE, SIGMA, colour_distance
 from edge_depth_nerf.kernels.allocator import keep_freed_memory
 from edge_depth_nerf.kernels.openmp import let_idle_threads_sleep
@@ -84,8 +86,8 @@ class ModelOptions:
     far_m: float = 1000.0
     """Where sampling ends along the ray, metres (replaces far_plane)."""
     depth_loss: DepthLossName = "edge"
-    """The loss on the prior: Eq. 4, nerfstudio's DS-NeRF or UrbanNeRF loss, UrbanNeRF's as published, a registered one,
-    or none (plain nerfacto)."""
+    """The loss on the prior: Eq. 4, DS-NeRF's, UrbanNeRF's as in nerfstudio or as published (-los), a registered one, or
+    none (plain nerfacto)."""
     losses: LossOptions = field(default_factory=LossOptions)
     """Options of these losses, by their names."""
     depth_loss_mult: float = 0.01
@@ -115,6 +117,15 @@ class ModelOptions:
     detail: bool = False
     """Add detail of the training pictures to rendered views, which then take longer; training stays the same
     (docs/method.md)."""
+
+    def check(self) -> None:
+        """Raise an InputError if an option is out of its range."""
+        near_m, far_m = self.near_m, self.far_m
+        planes = f"--pipeline.model.near-m {near_m:g} and --pipeline.model.far-m {far_m:g}"
+        require(0 <= near_m < far_m < math.inf, planes, "0 or more metres, and more than that")
+        for name in ("depth_loss_mult", "depth_loss_sharp", "sky_loss_mult", "surface_loss_mult"):
+            value = getattr(self, name)
+            require(0 <= value < math.inf, f"--pipeline.model.{name.replace('_', '-')} {value:g}", "0 or more")
 
 
 @dataclass

@@ -31,6 +31,8 @@ from edge_depth_nerf.scene.format import depth_sources, layers_of, read_transfor
 
 FARTHEST_UNITS = 1e6
 """nerfstudio's sampler turns a distance x beyond 1 into 1 - 1/(2x): float32 has no such number below 1 from 2^23 on."""
+_LOOKED_AT = 10_000
+"""So many pixels, in their random order, tell whether the prior's unit can be right."""
 STEPS_PER_CHECK = 50
 """On a GPU steps whose loss is not finite are counted, and the count is read once in so many steps."""
 MOST_NOT_FINITE = 5
@@ -75,11 +77,12 @@ class EdgeDepthPipeline(VanillaPipeline):
         """Build both parts; a model gets neither a prior nor further pixels that it would not use.
 
         Raises:
-            InputError: the model has a depth loss, and the depth maps give no training pixel a prior; or its far
-                plane is out of range. A scene without such maps is trained without the loss.
+            InputError: the model has a depth loss, and the depth maps give no training pixel a prior that it uses; or
+                an option is out of its range. A scene without such maps is trained without the loss.
         """
         model, data = config.model, config.datamanager
         assert isinstance(model, EdgeDepthNerfModelConfig) and isinstance(data, FisheyeDepthDataManagerConfig)
+        model.check()
         if model.depth_loss != "none" and data.depth_source == "auto" and not _has_depth(data):
             scene = escape(str(data.dataparser.data))
             if kwargs.get("test_mode", "val") == "val":
@@ -114,6 +117,16 @@ class EdgeDepthPipeline(VanillaPipeline):
                 f"{model.depth_loss!r}. Process the drive with LiDAR, make monocular maps with `edge-depth-nerf "
                 "estimate-depth`, or train without a prior with --pipeline.model.depth-loss none."
             )
+        if model.depth_loss != "none" and sampler is not None:
+            prior_m = sampler.table.batch(0, min(_LOOKED_AT, len(sampler.table))).prior_distance_m
+            prior_m = prior_m[prior_m > 0]
+            if len(prior_m) and not ((prior_m >= model.near_m) & (prior_m <= model.far_m)).any():
+                raise InputError(
+                    f"{manager.get_datapath()}: no depth prior is between the near plane ({model.near_m:g} m) and the "
+                    f"far one ({model.far_m:g} m); their median is {float(prior_m.median()):.3g} m. Check the unit of "
+                    "the depth maps: nerfstudio's is 0.001 m. If they are in metres, add `fisheye-depth-data "
+                    "--depth-unit-scale-factor 1` to the end of the command."
+                )
         assert isinstance(self.model, EdgeDepthNerfModel)
         self.detail = self.model.detail = TrainingDetail(self.model, manager.train_dataset)
         self.model.register_load_state_dict_post_hook(lambda *_: self.detail.forget())

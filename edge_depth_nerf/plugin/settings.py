@@ -2,11 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import fields, is_dataclass
 from typing import Any
 
+from edge_depth_nerf.base.errors import InputError
+
 SAID_ANYWAY = ("data", "pipeline.datamanager.data", "timestamp", "experiment_name", "max_num_iterations")
 """Settings that each training has of its own, or that are printed beside the changed ones."""
+
+WITHOUT_EFFECT = {
+    "pipeline.model.near_plane": "use --pipeline.model.near-m",
+    "pipeline.model.far_plane": "use --pipeline.model.far-m",
+    "pipeline.model.use_appearance_embedding": "use --pipeline.model.exposure embedding",
+    "pipeline.model.camera_optimizer.trans_l2_penalty": "use --pipeline.model.camera-optimizer.sigma-m",
+    "pipeline.model.camera_optimizer.rot_l2_penalty": "use --pipeline.model.camera-optimizer.sigma-deg",
+    "pipeline.datamanager.dataparser.scale_factor": "use --pipeline.datamanager.dataparser.metres-per-unit",
+    **dict.fromkeys(
+        (
+            *(f"pipeline.model.{name}" for name in ("enable_collider", "collider_params", "loss_coefficients")),
+            *(f"pipeline.datamanager.{name}_on_gpu" for name in ("images", "masks")),
+            *(f"pipeline.datamanager.{split}_num_images_to_sample_from" for split in ("train", "eval")),
+            *(f"pipeline.datamanager.{split}_num_times_to_repeat_images" for split in ("train", "eval")),
+            *(f"pipeline.datamanager.{name}" for name in ("patch_size", "pixel_sampler", "eval_image_indices")),
+        ),
+        "leave it out",
+    ),
+}
+"""nerfstudio's options that nothing here reads, and what to do instead."""
 
 
 def flattened(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -31,3 +54,15 @@ def changed_settings(config: Any, usual: Any) -> dict[str, Any]:
         for name, value in flattened(config).items()
         if name not in SAID_ANYWAY and (name not in before or before[name] != value)
     }
+
+
+def check_effect(changed: Iterable[str]) -> None:
+    """Raise an InputError if some of the changed settings have no effect."""
+    found = [
+        f"--{name.replace('_', '-')} has no effect: {instead}"
+        for name in changed
+        for option, instead in WITHOUT_EFFECT.items()
+        if name == option or name.startswith(f"{option}.")
+    ]
+    if found:
+        raise InputError("; ".join(found) + ".")

@@ -37,7 +37,7 @@ from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, tran
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
 from edge_depth_nerf.plugin.pipeline import EdgeDepthPipeline, NotFiniteError
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
-from edge_depth_nerf.plugin.settings import changed_settings
+from edge_depth_nerf.plugin.settings import changed_settings, check_effect
 from edge_depth_nerf.plugin.step_graphs import Capture, GpuCapture, StepGraphs, why_not
 
 TOLD_EVERY_S, TOLD_EVERY_SHARE = 10.0, 0.05
@@ -64,13 +64,17 @@ class EdgeDepthTrainerConfig(TrainerConfig, TrainingOptions):
     _target: type = field(default_factory=lambda: EdgeDepthTrainer)
     """Target class to instantiate."""
 
-    def print_to_terminal(self) -> None:
-        """Print what is trained, and the settings that differ from the method's own; config.yml has all of them."""
+    def _changed(self) -> dict[str, Any]:
+        """Give the settings that differ from the method's own."""
         from nerfstudio.configs.method_configs import all_methods  # imports this plugin's methods
 
+        return changed_settings(self, all_methods.get(str(self.method_name), self))
+
+    def print_to_terminal(self) -> None:
+        """Print what is trained, and the settings that differ from the method's own; config.yml has all of them."""
         scene = self.pipeline.datamanager.data
         lines = [f"{self.method_name}: {self.max_num_iterations} steps on {self.machine.device_type}, scene {scene}"]
-        for name, value in changed_settings(self, all_methods.get(self.method_name)).items():  # pyrefly: ignore
+        for name, value in self._changed().items():
             lines.append(f"  --{name.replace('_', '-')} {value.__qualname__ if isinstance(value, type) else value}")
         say(CONSOLE, "\n".join(lines))
 
@@ -79,10 +83,11 @@ class EdgeDepthTrainerConfig(TrainerConfig, TrainingOptions):
 
         Raises:
             FileNotFoundError: there is no scene at `--data`; then nothing is written.
-            InputError: it is to train on a GPU where there is none.
+            InputError: it is to train on a GPU where there is none, or a changed setting has no effect.
         """
         say_errors_plainly()
         ignore_deprecations_of_host()
+        check_effect(self._changed())
         if self.machine.device_type == "cuda" and not torch.cuda.is_available():
             raise InputError(
                 "--machine.device-type cuda: torch finds no GPU here (`edge-depth-nerf doctor` says why). Add "

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
@@ -141,6 +141,11 @@ def read_transforms(path: Path) -> dict[str, Any]:
             raise InputError(f"{where}: {shown(frame['file_path'])} has a frame already; expected one per picture.")
         names.add(frame["file_path"])
     _check_scene(meta, path)
+    spelled = {PurePosixPath(name): name for name in names}
+    for key in (f"{split}_filenames" for split in ("train", "val", "test")):
+        if key in meta:
+            # ./images/1.png is images/1.png, as for nerfstudio
+            meta[key] = [spelled.get(PurePosixPath(name), name) for name in meta[key]]
     return meta
 
 
