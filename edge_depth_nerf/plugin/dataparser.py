@@ -73,8 +73,8 @@ class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig, SceneOptions):
     auto_scale_poses: tyro.conf.Suppress[bool] = False
     """nerfstudio's scaling of all poses into +-1. It is off: metres_per_unit sets the scale."""
     eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
-    """How a scene without split files is divided. interval holds out every eval_interval-th picture; filename those with
-    eval in their names, and train in the others'."""
+    """How a scene without split files is divided. interval holds out every eval_interval-th picture; filename those
+    with eval in their names, and train in the others'."""
 
 
 def check_split(meta: dict[str, Any], path: Path) -> None:

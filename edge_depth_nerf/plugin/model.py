@@ -86,8 +86,8 @@ class ModelOptions:
     far_m: float = 1000.0
     """Where sampling ends along the ray, metres (replaces far_plane)."""
     depth_loss: DepthLossName = "edge"
-    """The loss on the prior: Eq. 4, DS-NeRF's, UrbanNeRF's as in nerfstudio or as published (-los), a registered one, or
-    none (plain nerfacto)."""
+    """The loss on the prior: Eq. 4, DS-NeRF's, UrbanNeRF's as in nerfstudio or as published (-los), a registered one,
+    or none (plain nerfacto)."""
     losses: LossOptions = field(default_factory=LossOptions)
     """Options of these losses, by their names."""
     depth_loss_mult: float = 0.01
