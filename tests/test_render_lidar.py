@@ -26,7 +26,7 @@ from edge_depth_nerf.films.intensities import Intensities
 from edge_depth_nerf.films.options import RenderLidarOptions
 from edge_depth_nerf.films.scan_command import render_lidar
 from edge_depth_nerf.films.scan_film import SIZE_PX, draw_scan
-from edge_depth_nerf.films.scanning import RayDrop
+from edge_depth_nerf.films.scanning import RayDrop, came_back, recorded_pattern
 from edge_depth_nerf.lidar.patterns import ScanPattern
 from edge_depth_nerf.lidar.roughness import roughness
 from edge_depth_nerf.lidar.scans import PointTimes, ScanFormat, read_scan
@@ -111,6 +111,27 @@ def test_what_is_there_stays_and_what_changed_is_written_again(drive, scanner, t
     again = process(drive, output, holdout_beams=5)
     written = [sweep.frame for sweep in again.sweeps if sweep.path.stat().st_mtime_ns != times[sweep.path.name]]
     assert written == [5, 7]
+
+
+def test_a_ring_has_one_number_in_every_sweep(tmp_path):
+    """Upper beams have no return where the sky is open; another sweep's rings cannot be told apart."""
+    room = write_room_drive(tmp_path / "drive", frames=5, size=32)
+    for frame in room.frames:
+        points = measure(room, frame)
+        upward = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+        write_points(room.sweep(frame), points[upward < 2] if frame == 3 else points)
+    anywhere = np.random.default_rng(0).normal(size=(2000, 3))
+    write_points(room.sweep(4), 10 * anywhere / np.linalg.norm(anywhere, axis=1, keepdims=True))
+    found = process(room, tmp_path / "scene")
+    rings = [np.unique(sweep.read().ring).tolist() for sweep in found.sweeps]
+    assert rings == [[*range(12)]] * 3 + [[*range(4, 12)], [-1]]
+    pattern = recorded_pattern(found)
+    assert pattern is not None
+    np.testing.assert_allclose(pattern.elevation_rad, PATTERN.elevation_rad, atol=2e-3)
+    # of the rays that the lost beams cast none came back, and of the others all
+    open_sky = found.sweeps[3]
+    back = came_back(open_sky, open_sky.read(), pattern, found.trajectory)
+    assert not back[:4].any() and back[4:].mean() > 0.9
 
 
 def test_a_broken_sweep_is_left_out(tmp_path):
@@ -453,6 +474,34 @@ def test_an_interrupted_run_goes_on(trained):
     assert [path.name for path in sorted(times) if path.stat().st_mtime_ns != times[path]] == [f"{3:010d}.ply"]
     with pytest.raises(InputError, match="holds other scans"):
         render_lidar(RenderLidarOptions(trained, every=3, sensor="vlp-16"), QUIET)
+
+
+def test_scans_of_another_path_or_training_are_not_kept(trained, tmp_path):
+    path = tmp_path / "path.txt"
+    options = RenderLidarOptions(trained, sensor="vlp-16", path=str(path))
+    path.write_text("0 1000 3800 117 0 0 0 1\n0.1 1000.5 3800 117 0 0 0 1\n")
+    before = (render_lidar(options, QUIET) / "0000000000.ply").read_bytes()
+    path.write_text("0 1000 3801 117 0 0 0 1\n0.1 1000.5 3801 117 0 0 0 1\n")
+    with pytest.raises(InputError, match="holds other scans"):
+        render_lidar(options, QUIET)
+    assert (render_lidar(replace(options, output=tmp_path / "moved"), QUIET) / "0000000000.ply").read_bytes() != before
+    torch.save({}, trained.parent / "nerfstudio_models/step-000000019.ckpt")
+    with pytest.raises(InputError, match="holds other scans"):
+        render_lidar(replace(options, output=tmp_path / "moved"), QUIET)
+
+
+def test_what_is_missing_is_named_before_anything_is_rendered(trained, scanner, monkeypatch):
+    monkeypatch.setattr(scan_command, "load_model", None)
+    lost = replace(scanner.sweeps[2], path=scanner.sweeps[2].path.with_name("lost.npz"))
+    few = replace(scanner, sweeps=(*scanner.sweeps[:2], lost, *scanner.sweeps[3:]))
+    with monkeypatch.context() as patch, pytest.raises(FileNotFoundError, match=r"lost\.npz: no such file"):
+        patch.setattr(scan_command, "scanners_of", lambda *_: {"velodyne": few})
+        patch.setattr(scan_command, "recorded_pattern", lambda _: PATTERN)
+        render_lidar(RenderLidarOptions(trained), QUIET)
+    shutil.rmtree(trained.parent / "nerfstudio_models")
+    with pytest.raises(InputError, match="nerfstudio_models: has no whole checkpoint"):
+        render_lidar(RenderLidarOptions(trained), QUIET)
+    assert not (trained.parent / "scans").exists()
 
 
 @pytest.mark.parametrize(

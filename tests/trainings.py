@@ -16,11 +16,12 @@ from edge_depth_nerf.plugin.trainer import EdgeDepthTrainer
 
 
 def write_config(config: Path, scene: Path) -> Path:
-    """Write the config.yml of a training on a scene, with 10 m in a unit; without checkpoints."""
+    """Write the config.yml of a training on a scene, with 10 m in a unit, and a checkpoint that holds nothing."""
     settings = edge_depth_nerf_lite.config
     parser = FisheyeDepthDataParserConfig(metres_per_unit=10.0)
     datamanager = replace(settings.pipeline.datamanager, dataparser=parser, data=scene)  # pyrefly: ignore
-    config.parent.mkdir(parents=True, exist_ok=True)
+    (config.parent / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
+    torch.save({}, config.parent / "nerfstudio_models" / "step-000000009.ckpt")
     config.write_text(yaml.dump(replace(settings, pipeline=replace(settings.pipeline, datamanager=datamanager))))
     return config
 

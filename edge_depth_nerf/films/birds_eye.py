@@ -31,7 +31,7 @@ from edge_depth_nerf.films.ground_plan import TILE_PX, GroundPlan, Tile, driven_
 from edge_depth_nerf.films.options import RANGES, BirdsEyeOptions
 from edge_depth_nerf.films.paths import up_of
 from edge_depth_nerf.films.placed import placed, poses_of
-from edge_depth_nerf.films.scanning import HIT, load_model
+from edge_depth_nerf.films.scanning import CHECKPOINTS, HIT, check_checkpoint, load_model
 from edge_depth_nerf.films.seen import TrainingViews
 from edge_depth_nerf.jobs.runs import steps_done
 from edge_depth_nerf.plugin.compat import quiet_host
@@ -75,11 +75,12 @@ def render_birds_eye(options: BirdsEyeOptions, console: Console | None = None) -
         "made_by": f"edge-depth-nerf {__version__}",
         "scene": str(scene.path),
         "load_config": str(options.load_config),
-        "steps": steps_done(options.load_config.parent / "nerfstudio_models"),
+        "steps": steps_done(options.load_config.parent / CHECKPOINTS),
         **{name: getattr(options, name) for name in RANGES},
         "width": plan.width,
         "height": plan.height,
     }
+    check_checkpoint(options.load_config)
     open_folder(output, output / RECORD, record, "pictures")
     remove_leftovers(output)
     if not all((output / name).is_file() for name in (PICTURE, HEIGHT)):

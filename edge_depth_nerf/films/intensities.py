@@ -18,6 +18,8 @@ LEAST_M = 0.05
 """Neighbours weigh by their distance, none more than one this far away."""
 RANGES = 14
 """Parts of the distance, two for each doubling from 1 m."""
+MOST_POINTS = 4_000_000
+"""More are not learned from; each takes 165 bytes meanwhile."""
 LEAST_POINTS = 50
 """A beam at a range with fewer points is taken as all beams together."""
 
@@ -76,11 +78,12 @@ class Intensities:
     def learned(cls, scanner: SceneScanner) -> Intensities | None:
         """Learn from the sweeps that training saw; None if the scanner measures no intensity."""
         parts: list[tuple[NDArray, ...]] = []
-        for sweep in scanner.sweeps:
-            if not sweep.held_out:
-                rays = sweep.read()
-                of = ~rays.held_out
-                parts.append((rays.points_m[of], rays.intensity[of], rays.ring[of], rays.distance_m[of]))
+        training, rng = [sweep for sweep in scanner.sweeps if not sweep.held_out], np.random.default_rng(0)
+        for sweep in training:
+            rays = sweep.read()
+            of = np.flatnonzero(~rays.held_out)
+            of = rng.permutation(of)[: MOST_POINTS // len(training)]
+            parts.append((rays.points_m[of], rays.intensity[of], rays.ring[of], rays.distance_m[of]))
         if not parts:
             return None
         points_m, intensity, ring, distance_m = (np.concatenate(each) for each in zip(*parts, strict=True))

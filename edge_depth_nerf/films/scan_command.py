@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,13 +22,16 @@ from edge_depth_nerf.films.placed import outside, placed
 from edge_depth_nerf.films.scan_files import read_points, write_scan
 from edge_depth_nerf.films.scan_film import write_film
 from edge_depth_nerf.films.scanning import (
+    CHECKPOINTS,
     LearnedScanner,
     RayDrop,
+    check_checkpoint,
     evaluate,
     learn_ray_drop,
     load_model,
     recorded_pattern,
 )
+from edge_depth_nerf.jobs.runs import steps_done
 from edge_depth_nerf.lidar.patterns import SENSORS, TEN_TURNS, ScanPattern, pattern_of_scan, rings_of
 from edge_depth_nerf.lidar.scans import ScanFormat, read_scan
 from edge_depth_nerf.lidar.trajectory import Trajectory
@@ -65,13 +69,20 @@ def render_lidar(options: RenderLidarOptions, console: Console | None = None) ->
     times_s, poses = _path(options, scene, scanner)
     if warning := outside(poses, scene):
         say(console, warning, "yellow")
+    cast = (pattern.directions, pattern.offset_s, times_s, poses, np.array(pattern.reach_m))
     record = {
         "made_by": f"edge-depth-nerf {__version__}",
         "scene": str(scene.path),
         "load_config": str(options.load_config),
+        "steps": steps_done(options.load_config.parent / CHECKPOINTS),
         **{name: getattr(options, name) for name in ("sensor", "path", "shift_m", "every", "form")},
         "scanner": None if scanner is None else scanner.name,
+        "rays": hashlib.sha256(b"".join(np.ascontiguousarray(each).tobytes() for each in cast)).hexdigest(),
     }
+    check_checkpoint(options.load_config)
+    for sweep in () if scanner is None else scanner.sweeps:
+        if not sweep.path.is_file():
+            raise FileNotFoundError(f"{sweep.path}: no such file, but {scene.path} names it. Process the drive again.")
     open_folder(output, output / RECORD, record, "scans")
     with console.status("Loading the model …"), quiet_host():
         caster = Caster(load_model(options.load_config, scene.path), to_model)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,11 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.numbers import spread_over
 from edge_depth_nerf.films.intensities import Intensities
 from edge_depth_nerf.films.scan_files import Scan
+from edge_depth_nerf.jobs.runs import newest_checkpoint
 from edge_depth_nerf.lidar.patterns import ScanPattern, pattern_of_scan
 from edge_depth_nerf.lidar.sweeps import MIN_RANGE_M
 from edge_depth_nerf.lidar.trajectory import Trajectory
@@ -22,8 +25,12 @@ from edge_depth_nerf.plugin.scanning import MOST_RAYS, Cast, Caster, errors, hel
 from edge_depth_nerf.scene.reader import SceneFolder
 from edge_depth_nerf.scene.sweeps import UNKNOWN_RING, SceneScanner, SceneSweep, SweepRays
 
+CHECKPOINTS = "nerfstudio_models"
+"""nerfstudio's folder of them, beside config.yml."""
 HIT = 0.5
 """A ray that stops less than this share of its light hits nothing."""
+_LOOKED_AT = 16
+"""So many sweeps are searched for one with all rings."""
 MOST_LEARNED_SWEEPS = 4
 """For learning which rays come back, `MOST_RAYS` of all together."""
 
@@ -35,10 +42,22 @@ def load_model(load_config: Path, scene: Path) -> Any:
     def of_scene(config: Any) -> Any:
         config.pipeline.datamanager.data = scene
         config.pipeline.datamanager.dataparser.data = scene
+        # wherever the training lies now, and from whichever folder it was started
+        config.relative_model_dir = load_config.parent.absolute() / CHECKPOINTS
         return config
 
     _, pipeline, _, _ = eval_setup(load_config, test_mode="inference", update_config_callback=of_scene)
     return pipeline.model
+
+
+def check_checkpoint(load_config: Path) -> None:
+    """Raise an InputError if there is no whole checkpoint beside a training's config.yml."""
+    folder = load_config.parent / CHECKPOINTS
+    if newest_checkpoint(folder) is None:
+        raise InputError(
+            f"{folder}: has no whole checkpoint (step-….ckpt), which a training writes beside its config.yml. Train "
+            "on, or copy the whole folder of the training."
+        )
 
 
 def scan(caster: Caster, pattern: ScanPattern, time_s: float, scanner: Trajectory) -> tuple[Cast, NDArray, NDArray]:
@@ -62,15 +81,24 @@ def in_scanner(sweep: SceneSweep, rays: SweepRays, scanner: Trajectory) -> Float
 
 
 def recorded_pattern(scanner: SceneScanner) -> ScanPattern | None:
-    """Find the pattern of a drive's own scanner, from the middle one of its sweeps; None if that has no rings.
+    """Find the pattern of a drive's own scanner, from the sweep with most rings; None if none has the highest one.
 
     Raises:
         InputError: the sweep's points do not lie at regular azimuths.
     """
-    sweep = scanner.sweeps[len(scanner.sweeps) // 2]
-    rays = sweep.read()
-    if len(scanner.sweeps) < 2 or rays.ring.min() < 0:
+
+    def whole(places: Iterable[int]) -> Iterator[tuple[SceneSweep, SweepRays]]:
+        for sweep in (scanner.sweeps[place] for place in places):
+            rays = sweep.read()
+            if rays.ring.min(initial=UNKNOWN_RING + 2) == 0:
+                yield sweep, rays
+
+    some = whole(spread_over(len(scanner.sweeps), _LOOKED_AT))
+    found = max(some, key=lambda each: len(np.unique(each[1].ring)), default=None)
+    found = found or next(whole(range(len(scanner.sweeps))), None)
+    if len(scanner.sweeps) < 2 or found is None:
         return None
+    sweep, rays = found
     points_m = in_scanner(sweep, rays, scanner.trajectory)
     return pattern_of_scan(points_m, rays.ring, scanner.timing, str(sweep.path))
 
@@ -85,6 +113,11 @@ def came_back(
     found[rays.ring[known], pattern.columns(points_m[known])] = True
     # firings are not as regular as the pattern: one between two that came back did, too
     return found | (np.roll(found, 1, axis=1) & np.roll(found, -1, axis=1))
+
+
+def _has_rings(rays: SweepRays) -> bool:
+    """Whether it is known which ring measured each point: else nothing tells which rays did not come back."""
+    return bool(rays.ring.min(initial=0) > UNKNOWN_RING)
 
 
 class RayDrop:
@@ -128,7 +161,10 @@ def learn_ray_drop(caster: Caster, scanner: SceneScanner, pattern: ScanPattern) 
     training = [sweep for sweep in scanner.sweeps if not sweep.held_out]
     rng, casts, back = np.random.default_rng(0), [], []
     for sweep in (training[place] for place in spread_over(len(training), MOST_LEARNED_SWEEPS)):
-        whole = came_back(sweep, sweep.read(), pattern, scanner.trajectory)
+        rays = sweep.read()
+        if not _has_rings(rays):
+            continue
+        whole = came_back(sweep, rays, pattern, scanner.trajectory)
         rows, columns = (rng.integers(count, size=MOST_RAYS // MOST_LEARNED_SWEEPS) for count in whole.shape)
         poses = scanner.trajectory.at(sweep.time_s + pattern.offset_s)[columns]
         along = np.einsum("nij,nj->ni", poses[:, :3, :3], pattern.directions[rows, columns])
@@ -217,9 +253,10 @@ def _of_whole(
 ) -> dict[str, float]:
     cast, origins, directions = scan(learned.caster, pattern, sweep.time_s, scanner)
     kept = learned.ray_drop.kept(cast, pattern.reach_m)
-    lost, truly = ~kept, ~came_back(sweep, rays, pattern, scanner)
-    both = (lost & truly).sum()
     points_m = (origins[None] + directions * cast.distance_m[..., None])[kept]
-    figures = {"drop_f1": float(2 * both / max(1, lost.sum() + truly.sum()))}
+    figures = {}
+    if _has_rings(rays):
+        lost, truly = ~kept, ~came_back(sweep, rays, pattern, scanner)
+        figures["drop_f1"] = float(2 * (lost & truly).sum() / max(1, lost.sum() + truly.sum()))
     # a scan without points is no distance away
     return figures | {"chamfer_m": chamfer_m(points_m, rays.points_m)} if len(points_m) else figures

@@ -144,6 +144,30 @@ def _are_level(elevation: NDArray[np.float64], ring: NDArray[np.int64], points_m
     return not widths or float(np.median(widths)) < _WIDEST_RING_RAD
 
 
+def elevations_of(
+    points_m: Float64[np.ndarray, "points 3"], ring: Int[np.ndarray, "points"]
+) -> Float64[np.ndarray, "rings"]:
+    """Elevations of the rings of a scan, radians: medians, of far points where there are enough."""
+    far = np.linalg.norm(points_m, axis=1) > _FAR_M
+    elevation = np.arctan2(points_m[:, 2], np.hypot(points_m[:, 0], points_m[:, 1]))
+    found = []
+    for number in range(ring.max() + 1):
+        chosen = ring == number
+        chosen = chosen & far if (chosen & far).sum() >= _LEAST_OF_RING else chosen
+        found.append(np.median(elevation[chosen]))
+    return np.array(found)
+
+
+def place_among(elevations: Float64[np.ndarray, "rings"], every: Float64[np.ndarray, "beams"]) -> int | None:
+    """Give which of all beams of a scanner measured the highest ring of a scan: where the sky is open, it is not 0.
+
+    None: the scan has more rings than these beams.
+    """
+    places = range(len(every) - len(elevations) + 1)
+    off = [float(np.median(np.abs(elevations - every[place : place + len(elevations)]))) for place in places]
+    return int(np.argmin(off)) if off else None
+
+
 def pattern_of_scan(
     points_m: Float64[np.ndarray, "points 3"],
     ring: Int[np.ndarray, "points"],
@@ -162,16 +186,9 @@ def pattern_of_scan(
         InputError: its points do not lie at regular azimuths.
     """
     distance = np.linalg.norm(points_m, axis=1)
-    elevation = np.arctan2(points_m[:, 2], np.hypot(points_m[:, 0], points_m[:, 1]))
     azimuth = np.arctan2(points_m[:, 1], points_m[:, 0])
-    elevations, steps = [], []
-    for number in range(ring.max() + 1):
-        chosen = ring == number
-        far = chosen & (distance > _FAR_M)
-        elevations.append(np.median(elevation[far if far.sum() >= _LEAST_OF_RING else chosen]))
-        steps.append(np.diff(np.sort(azimuth[chosen])))
     # two echoes of one firing have no step between them
-    every = np.concatenate(steps)
+    every = np.concatenate([np.diff(np.sort(azimuth[ring == number])) for number in range(ring.max() + 1)])
     every = every[every > 2 * np.pi / MOST_FIRINGS / 2]
     firings = round(2 * np.pi / float(np.median(every))) if len(every) else 0
     if not _LEAST_OF_RING <= firings <= MOST_FIRINGS:
@@ -179,4 +196,4 @@ def pattern_of_scan(
             f"{where}: {firings} measurements of a ring in a turn, expected {_LEAST_OF_RING} to {MOST_FIRINGS}. "
             f"Name a scanner: --sensor {', '.join(SENSORS)}."
         )
-    return ScanPattern("recorded", np.array(elevations), firings, float(distance.max()), timing or TEN_TURNS)
+    return ScanPattern("recorded", elevations_of(points_m, ring), firings, float(distance.max()), timing or TEN_TURNS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Collection
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +18,8 @@ from rich.console import Console
 from edge_depth_nerf.base.console import run_jobs
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import write_text
-from edge_depth_nerf.lidar.patterns import rings_of
+from edge_depth_nerf.base.numbers import spread_over
+from edge_depth_nerf.lidar.patterns import elevations_of, place_among, rings_of
 from edge_depth_nerf.lidar.sweeps import Sweep, held_out_beams
 from edge_depth_nerf.lidar.trajectory import MAX_POSE_GAP_S, Trajectory
 from edge_depth_nerf.lidar.world import offsets_s
@@ -27,6 +29,10 @@ from edge_depth_nerf.process.recording import RecordedSweep, Recording
 from edge_depth_nerf.scene.sweeps import UNKNOWN_RING, SceneScanner, SceneSweep, SweepRays, write_rays
 
 FOLDER, MADE_OF = "sweeps", "made_of.sha256"
+_VERSION = 2
+"""Of what is written; raised when it changes."""
+_LOOKED_AT = 16
+"""So many sweeps, spread over the drive, tell how many beams a scanner has."""
 
 
 def keep_sweeps(
@@ -68,10 +74,15 @@ def keep_sweeps(
             kept.append(SceneSweep(path, name, sweep.frame, sweep.time_s, sweep.frame in held_out, pose))
         scanners.append(SceneScanner(name, tuple(kept), sweeps[0].timing))
         _remove_those_of_others(scanners[-1], sweeps, options)
-        for recorded, one in zip(sweeps, kept, strict=True):
-            if not (one.path.is_file() and one.path.stat().st_mtime_ns > recorded.path.stat().st_mtime_ns):
-                write = partial(_write, one.path, recorded, recording.trajectory, offset_m, options)
-                jobs.append(partial(read_if_whole, write, strict=options.strict))
+        missing = [
+            (recorded, one.path)
+            for recorded, one in zip(sweeps, kept, strict=True)
+            if not (one.path.is_file() and one.path.stat().st_mtime_ns > recorded.path.stat().st_mtime_ns)
+        ]
+        beams = _beams(sweeps) if missing else None
+        for recorded, path in missing:
+            write = partial(_write, path, recorded, recording.trajectory, offset_m, options, beams)
+            jobs.append(partial(read_if_whole, write, strict=options.strict))
     if jobs:
         run_jobs(jobs, "Keeping the scanners' rays", console)
     found = [
@@ -83,7 +94,7 @@ def keep_sweeps(
 
 def _remove_those_of_others(scanner: SceneScanner, recorded: list[RecordedSweep], options: ProcessOptions) -> None:
     """Remove a scanner's rays if they were made of other sweeps, or with other poses or options."""
-    made_of: list[object] = [scanner.timing, options.raw_lidar, options.holdout_beams]
+    made_of: list[object] = [_VERSION, scanner.timing, options.raw_lidar, options.holdout_beams]
     for sweep, one in zip(recorded, scanner.sweeps, strict=True):
         made_of.append((sweep.path.name, sweep.time_s, one.scanner_to_scene.tolist()))
     digest = hashlib.sha256(repr(made_of).encode()).hexdigest()
@@ -94,18 +105,43 @@ def _remove_those_of_others(scanner: SceneScanner, recorded: list[RecordedSweep]
         write_text(stated, digest)
 
 
+def _beams(sweeps: list[RecordedSweep]) -> NDArray[np.float64] | None:
+    """Elevations of a scanner's beams, by the sweep that has most of them; None if none can be told apart."""
+    found: list[NDArray[np.float64]] = []
+    for number in spread_over(len(sweeps), _LOOKED_AT):
+        sweep = read_if_whole(sweeps[number].read)
+        with suppress(InputError):
+            if sweep is not None:
+                points_m = sweep.points_m.numpy()
+                found.append(elevations_of(points_m, rings_of(points_m, "")))
+    return max(found, key=len, default=None)
+
+
 def _write(
-    path: Path, recorded: RecordedSweep, trajectory: Trajectory, offset_m: NDArray, options: ProcessOptions
+    path: Path,
+    recorded: RecordedSweep,
+    trajectory: Trajectory,
+    offset_m: NDArray,
+    options: ProcessOptions,
+    elevations: NDArray[np.float64] | None,
 ) -> bool:
     path.unlink(missing_ok=True)
-    write_rays(path, rays_of(recorded.read(), recorded, trajectory, offset_m, options))
+    write_rays(path, rays_of(recorded.read(), recorded, trajectory, offset_m, options, elevations))
     return True
 
 
 def rays_of(
-    sweep: Sweep, recorded: RecordedSweep, trajectory: Trajectory, offset_m: NDArray, options: ProcessOptions
+    sweep: Sweep,
+    recorded: RecordedSweep,
+    trajectory: Trajectory,
+    offset_m: NDArray,
+    options: ProcessOptions,
+    elevations: NDArray[np.float64] | None,
 ) -> SweepRays:
-    """Give a sweep's measurements as rays in the scene, whose origin is at `offset_m` in the recording's world."""
+    """Give a sweep's measurements as rays in the scene, whose origin is at `offset_m` in the recording's world.
+
+    `elevations`: of all beams of the scanner, which number the rings of the sweep; None: not known.
+    """
     offset_s = offsets_s(sweep, recorded.timing, deskew=not options.raw_lidar)
     in_vehicle = torch.from_numpy(recorded.to_vehicle)
     mounted = in_vehicle[:3, 3].expand(len(sweep.points_m), 3)
@@ -115,10 +151,11 @@ def rays_of(
     )
     along = there - origin
     distance = np.linalg.norm(along, axis=1)
-    try:
-        ring = rings_of(sweep.points_m.numpy(), str(recorded.path))
-    except InputError:
-        ring = np.full(len(distance), UNKNOWN_RING)
+    ring = np.full(len(distance), UNKNOWN_RING)
+    with suppress(InputError):
+        of_sweep = rings_of(points_m := sweep.points_m.numpy(), str(recorded.path))
+        place = None if elevations is None else place_among(elevations_of(points_m, of_sweep), elevations)
+        ring = ring if place is None else of_sweep + place
     beams = np.zeros(len(distance), np.int16)
     if options.holdout_beams:
         beams = held_out_beams(sweep, options.holdout_beams).numpy().astype(np.int16)

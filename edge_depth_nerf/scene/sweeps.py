@@ -43,7 +43,7 @@ class SweepRays:
     intensity: Float32[np.ndarray, "rays"]
     """As recorded; 0 where the scanner gives none."""
     ring: Int16[np.ndarray, "rays"]
-    """From the highest, 0, to the lowest; -1 where rings cannot be told apart."""
+    """From the scanner's highest, 0, to its lowest, in each sweep alike; -1 where rings cannot be told apart."""
     of_beam: Int16[np.ndarray, "rays"]
     """1: of a beam that is held out of everything (`--holdout-beams`)."""
 
