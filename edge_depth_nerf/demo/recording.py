@@ -61,9 +61,10 @@ def _kinds(root: Path, output: Path) -> Iterator[ProcessOptions]:
     """Give the options of each converter that the folder is laid out for, for the first of its sequences."""
     if any((root / name).is_file() for name in ("rig.toml", "rig.json")):
         yield RigOptions(root=root, output=output)
-    for path in sorted(root.glob("data_3d_raw/*/")):
+    # before Python 3.11 this finds files, too
+    for path in filter(Path.is_dir, sorted(root.glob("data_3d_raw/*/"))):
         yield Kitti360Options(root=root, sequence=path.name, output=output)
-    for path in [*sorted(root.glob("*_*_*/*_sync/")), *sorted(root.glob("sequences/*/"))]:
+    for path in filter(Path.is_dir, [*sorted(root.glob("*_*_*/*_sync/")), *sorted(root.glob("sequences/*/"))]):
         yield KittiOptions(root=root, sequence=path.name, output=output)
     if all((root / name).exists() for name in ("image", "bin", "calibration.toml")):
         yield JbnuDepth360Options(root=root, calibration=root / "calibration.toml", output=output)

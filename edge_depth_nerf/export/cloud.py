@@ -37,7 +37,9 @@ WINDOW_PX = 7
 FLATTEST = 0.03
 """Cosine between normal and ray. Surfaces that are seen at a flatter angle are mostly the edges of things."""
 MERGE_AT = 2_000_000
-"""So many points are collected before they are averaged; bounds the memory for long drives."""
+"""So many points are collected before they are averaged."""
+MOST_MEANWHILE = 4
+"""Cubes grow if there are so many times the points that are wanted; bounds the memory for long drives."""
 _MAX_PART_BYTES = 1 << 28
 
 
@@ -175,14 +177,15 @@ def merge_parts(paths: Sequence[Path], voxel_m: float, most_points: int) -> Clou
         # weight, number of points, and weighted sums of place, colour and normal
         sums = (weight, np.ones_like(weight), weight * part.points_m, weight * part.colours, weight * part.normals)
         waiting.append(np.hstack(sums))
-        if sum(map(len, waiting)) > MERGE_AT or number == len(paths) - 1:
+        is_last = number == len(paths) - 1
+        if sum(map(len, waiting)) > MERGE_AT or is_last:
             rows = np.concatenate([rows, *waiting])
             keys = np.concatenate([keys, *(voxel_keys(each[:, 2:5] / each[:, :1], voxel_m) for each in waiting)])
             rows, keys = _summed(rows, keys)
             waiting = []
-    while len(rows) > most_points:
-        voxel_m *= 1.2
-        rows, keys = _summed(rows, voxel_keys(rows[:, 2:5] / rows[:, :1], voxel_m))
+            while len(rows) > (most_points if is_last else MOST_MEANWHILE * most_points):
+                voxel_m *= 1.2
+                rows, keys = _summed(rows, voxel_keys(rows[:, 2:5] / rows[:, :1], voxel_m))
     weight = rows[:, :1]
     normals = rows[:, 8:11] / np.maximum(np.linalg.norm(rows[:, 8:11], axis=1, keepdims=True), 1e-12)
     return Cloud(rows[:, 2:5] / weight, rows[:, 5:8] / weight, normals, np.sqrt(rows[:, 1] / rows[:, 0]))

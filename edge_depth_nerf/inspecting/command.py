@@ -228,8 +228,8 @@ def _rows(cameras: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
         "pixels with a prior": lambda c: _spread(c["prior_share"], ".0%"),
         "without a prior (sky, …)": lambda c: _number(c["no_prior_share"], ".0%"),
         "LiDAR / motion's distance": lambda c: fitted(c, "{ratio:.2f} (±{ratio_spread:.2f})"),
-        "the same left, ahead, right": lambda c: " ".join(
-            _number(part, ".2f") for one in c["lidar_fit"] for part in one["ratio_by_side"]
+        "the same left, ahead, right": lambda c: (
+            " ".join(_number(part, ".2f") for one in c["lidar_fit"] for part in one["ratio_by_side"]) or "–"
         ),
         "contrast agrees at LiDAR": lambda c: fitted(c, "{correlation:.2f}"),
         "edges at LiDAR's / beside": lambda c: fitted(c, "{edge:.2f}"),
