@@ -12,6 +12,7 @@ from nerfstudio.model_components.losses import ds_nerf_depth_loss, urban_radianc
 from nerfstudio.model_components.renderers import DepthRenderer
 from nerfstudio.models.nerfacto import NerfactoModel
 
+from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.method.depth_losses import DsNerfLoss, EdgeLoss, Level, UrbanNerfLoss, UrbanNerfSightLoss
 from edge_depth_nerf.method.losses import edge_loss, urban_nerf_loss
 from edge_depth_nerf.plugin.compat import lpips_not_built
@@ -127,6 +128,13 @@ def test_urban_nerf_of_its_authors_is_in_metres_and_narrows():
         assert torch.allclose(losses["urban_nerf_los_loss"], 0.5 * total / 3)
     losses["urban_nerf_los_loss"].backward()
     assert are_taught(model.field.mlp_base.parameters())
+
+
+def test_a_loss_that_varies_without_saying_so_is_not_trained(monkeypatch):
+    """A CUDA graph would repeat it as it was when it was recorded."""
+    monkeypatch.setattr(UrbanNerfSightLoss, "varies", False)
+    with pytest.raises(InputError, match="sigma_m is nan"):
+        trained_step(build(depth_loss="urban-nerf-los"))
 
 
 def test_without_a_depth_loss_it_is_nerfacto():

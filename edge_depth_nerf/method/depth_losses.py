@@ -48,7 +48,7 @@ class Level:
     final: Level | None = None
     """The final samples of the same rays; None where these are."""
     share_done: float = 0.0
-    """The share of the training that is behind, 0 to 1."""
+    """The share of the training that is behind, 0 to 1; NaN for a loss that does not say that it `varies`."""
 
     @cached_property
     def expected_m(self) -> Float[Tensor, "rays"]:

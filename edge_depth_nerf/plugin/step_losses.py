@@ -6,6 +6,7 @@ adds up those that its configuration asks for.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, make_dataclass
@@ -110,12 +111,14 @@ class PriorLoss:
         every = [*zip(step.outputs["weights_list"], step.outputs["ray_samples_list"], strict=True)][::-1]
         every = every[:1] if self.final_alone else every
         none_learns = not any(weights.requires_grad for weights, _ in every)
+        # a replayed step would have the share of the recorded one
+        share_done = step.share_done if self.loss.varies else math.nan
         levels, final = [], None
         for weights, samples in every:
             if weights.requires_grad or self.loss.of_resting_levels or none_learns:
                 edges_m = edges_between(samples.frustums.starts, samples.frustums.ends) * step.planes.metres_per_unit
                 given = weights.squeeze(-1), edges_m[:, :-1], edges_m[:, 1:], prior_m, sigma_m, final
-                levels.append(Level(*given, step.share_done))
+                levels.append(Level(*given, share_done))
                 final = final or levels[0]
         if self.sharp <= 0:
             return step.depth_weight * depth_loss(self.loss, levels, len(every))
