@@ -140,7 +140,7 @@ def test_poses_are_refined_without_its_pictures(drive, tmp_path, monkeypatch):
         asked = options(drive, tmp_path, holdout_cameras=held_out)
         recording = read_drive(asked)
         given = np.stack([drive.poses[frame] for frame in drive.frames])
-        assert refining._match(recording, asked, QUIET) == []
+        assert refining._match(recording, asked, QUIET, tmp_path / "matches") == []
     assert seen == [{KEPT, HELD_OUT}, {KEPT}]
     digests = {
         refining._digest("1", recording, options(drive, tmp_path, holdout_cameras=names), given)

@@ -3,6 +3,8 @@
 import dataclasses
 import math
 import sys
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.poses.matches import Matches, sights_of
+from edge_depth_nerf.poses.matches import Matches, PosedPicture, sights_of
 from edge_depth_nerf.poses.tracks import Tracks, features_joined, join_matches, reprojection_px, spread, triangulate
 from edge_depth_nerf.process.colmap import refine as refining
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, _Bundle, adjust_bundle
@@ -306,6 +308,43 @@ def refined(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Refined:
     (tmp_path / "none.png").touch()
     monkeypatch.chdir(tmp_path)
     return Refined(monkeypatch, tmp_path)
+
+
+def test_interrupted_matching_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    given = world(7)
+    matches = given.matches(0.2)
+    pairs = [(each.first, each.second) for each in matches]
+    matches[4] = matches[4].taken(np.zeros(len(matches[4]), bool))
+    nothing = partial(np.zeros, (1, 1, 3), np.uint8)
+    posed = [PosedPicture("", 0, given.lenses[camera], np.eye(4), nothing) for camera, _ in given.shots]
+    monkeypatch.setattr(refining, "colmap_lenses", lambda *_: {})
+    monkeypatch.setattr(refining, "FeatureMasks", lambda *_: None)
+    monkeypatch.setattr(refining, "posed_pictures", lambda *_: posed)
+    monkeypatch.setattr(refining, "pairs_to_match", lambda *_: pairs)
+    monkeypatch.setattr(refining, "_KEPT_TOGETHER", 3)
+    asked: list[list[tuple[int, int]]] = []
+
+    def matched(_: Any, left: list[tuple[int, int]], __: int) -> Iterator[Matches]:
+        asked.append(left)
+        for number, pair in enumerate(left):
+            if len(asked) == 1 and number == 7:
+                raise KeyboardInterrupt
+            yield matches[pairs.index(pair)]
+
+    monkeypatch.setattr(refining, "match_pictures", matched)
+    options, quiet = ProcessOptions(output=tmp_path), Console(quiet=True)
+    with pytest.raises(KeyboardInterrupt):
+        refining._match(recorded(given, given.path), options, quiet, tmp_path / "matches")
+    found = refining._match(recorded(given, given.path), options, quiet, tmp_path / "matches")
+    assert asked == [pairs, pairs[6:]]
+    expected = [each for each in matches if len(each)]
+    for one, other in zip(found, expected, strict=True):
+        assert (one.first, one.second) == (other.first, other.second)
+        np.testing.assert_array_equal(one.index, other.index)
+        for seen, true in ((one.in_first, other.in_first), (one.in_second, other.in_second)):
+            np.testing.assert_array_equal(seen.pixels, true.pixels)
+            np.testing.assert_allclose(seen.rays, true.rays, atol=1e-9)
+            np.testing.assert_allclose(seen.ray_per_pixel, true.ray_per_pixel, atol=1e-9)
 
 
 @pytest.mark.slow

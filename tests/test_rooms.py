@@ -31,7 +31,7 @@ MOST_LINES = {
     "edge_depth_nerf/poses": 760,
     "edge_depth_nerf/process": 5_665,
     "edge_depth_nerf/process/bags": 1_760,
-    "edge_depth_nerf/process/colmap": 1_611,
+    "edge_depth_nerf/process/colmap": 1_655,
     "edge_depth_nerf/process/kitti": 365,
     "edge_depth_nerf/process/kitti360": 550,
     "edge_depth_nerf/report": 750,

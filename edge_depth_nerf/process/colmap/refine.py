@@ -14,7 +14,8 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,11 +24,19 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 from rich.console import Console
 
-from edge_depth_nerf.base.console import progress_bars
-from edge_depth_nerf.base.files import file_stamp, read_image, read_json, sha256_of, write_json
+from edge_depth_nerf.base.console import in_turn
+from edge_depth_nerf.base.files import (
+    file_stamp,
+    read_image,
+    read_json,
+    read_npz,
+    sha256_of,
+    write_atomically,
+    write_json,
+)
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.lidar.trajectory import Trajectory
-from edge_depth_nerf.poses.matches import Matches, epipolar_distance_px, match_pictures
+from edge_depth_nerf.poses.matches import Matches, PosedPicture, epipolar_distance_px, match_pictures, sights_of
 from edge_depth_nerf.poses.tracks import Tracks, features_joined, join_matches, reprojection_px, spread, triangulate
 from edge_depth_nerf.process.colmap.bundle import Shot, Softness, adjust_bundle
 from edge_depth_nerf.process.colmap.models import colmap_lenses, import_pycolmap, pairs_to_match
@@ -39,6 +48,8 @@ from edge_depth_nerf.process.recording import RecordedPicture, Recording
 from edge_depth_nerf.scene.format import REFINED_POSES
 
 OPTION = "--refine-poses"
+MATCHES = ".cache/matches"
+"""Of a scene whose poses are being refined."""
 SOFTNESS = Softness(position_m=0.1, turn_rad=math.radians(0.3))
 """How far given poses are usually off."""
 FURTHEST_M = 0.5
@@ -54,6 +65,9 @@ _APART = (1, 2, 3, 5, 8)
 """So many frames lie between the matched pictures of one camera; 1 is the next."""
 _ACROSS = (0, 1, 2)
 """Between those of two cameras whose views overlap."""
+_KEPT_TOGETHER = 200
+"""The matches of so many pairs are kept in one file until the poses are refined."""
+_MOST_BYTES = 1 << 28
 _MOST_FEATURES = 2500
 _MOST_SIGHTS = 700
 """Of a picture, in the bundle."""
@@ -117,11 +131,13 @@ def refine_poses(recording: Recording, options: ProcessOptions, console: Console
     digest = _digest(pycolmap.__version__, recording, options, given)
     found = _read_refinement(options.output / REFINED_POSES, digest)
     if found is None:
-        matches = _match(recording, options, console)
+        store = options.output / MATCHES
+        matches = _match(recording, options, console, store / digest[:16])
         with console.status("Refining the poses …"):
             found = refine(pycolmap, shots, matches, given, reshoot=reshoot)
         arrays = {"vehicle_to_world": found.vehicle_to_world.tolist(), "supported": found.supported.tolist()}
         write_json(options.output / REFINED_POSES, {"digest": digest, **vars(found), **arrays})
+        shutil.rmtree(store, ignore_errors=True)
     if found.checks < _LEAST_CHECKS:
         return _kept(recording, f"only {found.checks} features could be matched for the check")
     distances = f"{found.before_px:.2f} px before, {found.after_px:.2f} px after"
@@ -202,8 +218,8 @@ def _shots(recording: Recording, frames: Sequence[int], given: Float64[np.ndarra
     ]
 
 
-def _match(recording: Recording, options: ProcessOptions, console: Console) -> list[Matches]:
-    """Match the pictures that were taken shortly after one another."""
+def _match(recording: Recording, options: ProcessOptions, console: Console, store: Path) -> list[Matches]:
+    """Match the pictures that were taken shortly after one another; go on with what an earlier run left in `store`."""
     lenses = colmap_lenses(recording, options)
     masks = FeatureMasks(recording, options, {name: lens.theta_max_rad for name, lens in lenses.items()})
     posed = posed_pictures(recording, masks, partial(_read, strict=options.strict))
@@ -212,14 +228,37 @@ def _match(recording: Recording, options: ProcessOptions, console: Console) -> l
         for one, other in pairs_to_match(recording, lenses, _APART, _ACROSS)
         if not {posed[one].camera, posed[other].camera} & {*options.holdout_cameras}
     ]
-    found = []
-    with progress_bars(console, counted=True) as progress:
-        task = progress.add_task("Matching pictures", total=len(pairs))
-        for matches in match_pictures(posed, pairs, _MOST_FEATURES):
-            if len(matches):
-                found.append(matches)
-            progress.advance(task)
-    return found
+    found: list[Matches] = []
+    while (block := store / f"{len(found):07d}.npz").is_file():
+        found += _read_matches(block, posed)
+    left, done = pairs[len(found) :], len(found)
+    matching = match_pictures(posed, left, _MOST_FEATURES)
+    shown = zip(in_turn(left, "Matching pictures", console, done), matching, strict=False)
+    for number, (_, matches) in enumerate(shown, 1):
+        found.append(matches)
+        if number % _KEPT_TOGETHER == 0:
+            _write_matches(store / f"{len(found) - _KEPT_TOGETHER:07d}.npz", found[-_KEPT_TOGETHER:])
+    return [matches for matches in found if len(matches)]
+
+
+def _write_matches(path: Path, found: Sequence[Matches]) -> None:
+    pairs = [(each.first, each.second, len(each)) for each in found]
+    pixels = [np.hstack([each.in_first.pixels, each.in_second.pixels]) for each in found]
+    arrays = {"pairs": np.array(pairs), "index": np.concatenate([each.index for each in found])}
+    arrays["pixels"] = np.concatenate(pixels)
+    write_atomically(path, lambda temporary: np.savez(temporary, **arrays))
+
+
+def _read_matches(path: Path, posed: Sequence[PosedPicture]) -> Iterator[Matches]:
+    arrays = read_npz(path, ("pairs", "index", "pixels"), _MOST_BYTES)
+    ends = arrays["pairs"][:, 2].cumsum()
+    for (first, second, count), end in zip(arrays["pairs"].tolist(), ends, strict=True):
+        of = slice(end - count, end)
+        seen = (
+            sights_of(posed[one].lens, arrays["pixels"][of, columns])
+            for one, columns in ((first, slice(0, 2)), (second, slice(2, 4)))
+        )
+        yield Matches(first, second, arrays["index"][of], *(sights for sights, _ in seen))
 
 
 def _read(picture: RecordedPicture, lens: Camera, strict: bool) -> np.ndarray:
