@@ -219,7 +219,7 @@ def _shots(recording: Recording, frames: Sequence[int], given: Float64[np.ndarra
 
 
 def _match(recording: Recording, options: ProcessOptions, console: Console, store: Path) -> list[Matches]:
-    """Match the pictures that were taken shortly after one another; go on with what an earlier run left in `store`."""
+    """Match the pictures that were taken shortly after one another; continue what an earlier run left in `store`."""
     lenses = colmap_lenses(recording, options)
     masks = FeatureMasks(recording, options, {name: lens.theta_max_rad for name, lens in lenses.items()})
     posed = posed_pictures(recording, masks, partial(_read, strict=options.strict))
