@@ -76,6 +76,20 @@ def test_folders_of_other_peoples_splits_are_no_cameras(tmp_path):
     assert len({*of_training, *(picture.frame for picture in held_out.pictures)}) == len(of_training) + len(held_out)
 
 
+def test_folders_with_equal_names_are_cameras(tmp_path):
+    folder = write_scene(tmp_path, frames=6, split=False)
+    with transforms(folder) as meta:
+        for index, frame in enumerate(meta["frames"]):
+            moved = Path("images", ("front", "left")[index % 2], f"{index // 2}.png")
+            (folder / moved).parent.mkdir(parents=True, exist_ok=True)
+            (folder / frame["file_path"]).rename(folder / moved)
+            frame["file_path"] = str(moved)
+    pictures = parse(folder, eval_mode="all").metadata["scene"].pictures
+    assert [(picture.camera, picture.frame) for picture in pictures] == [
+        (f"images/{name}", number) for name in ("front", "left") for number in range(3)
+    ]
+
+
 def test_lists_may_spell_names_otherwise(tmp_path):
     folder = write_scene(tmp_path)
     with transforms(folder) as meta:

@@ -35,7 +35,7 @@ MOST_LINES = {
     "edge_depth_nerf/process/kitti": 365,
     "edge_depth_nerf/process/kitti360": 550,
     "edge_depth_nerf/report": 750,
-    "edge_depth_nerf/scene": 2_105,
+    "edge_depth_nerf/scene": 2_110,
     "edge_depth_nerf/stereo": 900,
     "edge_depth_nerf/synthetic": 3_455,
     "tests": 35_900,

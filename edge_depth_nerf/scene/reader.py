@@ -61,7 +61,7 @@ class ScenePicture:
     camera: str
     """The frame's own word, or the folder of its pictures."""
     frame: int
-    """Number of the frame in the drive; in other people's scenes the picture's place in the order of names."""
+    """Number of the frame in the drive; in other people's scenes its place in the order of names."""
     lens: KannalaBrandt | Pinhole
     """The camera that nerfstudio sees."""
     position_m: Float64[np.ndarray, "3"]
@@ -419,10 +419,17 @@ def _camera_name(frame: dict[str, Any]) -> str:
 
 
 def _frame_numbers(frames: list[dict[str, Any]]) -> dict[str, int]:
-    """The frame number of each picture: the given one, else its own, as nothing tells which were taken together."""
+    """The frame number of each picture: the given one, else its place by name, in its folder if all have such names."""
     if all("frame" in frame for frame in frames):
         return {frame["file_path"]: frame["frame"] for frame in frames}
-    return {name: number for number, name in enumerate(sorted(frame["file_path"] for frame in frames))}
+    ordered = sorted(frame["file_path"] for frame in frames)
+    folders: dict[Path, list[str]] = {}
+    for name in ordered:
+        folders.setdefault(Path(name).parent, []).append(name)
+    # else folders are no cameras, but a split or whatever
+    are_cameras = len({tuple(Path(name).stem for name in names) for names in folders.values()}) == 1
+    together = list(folders.values()) if are_cameras else [ordered]
+    return {name: number for names in together for number, name in enumerate(names)}
 
 
 def _lens(meta: dict[str, Any], frame: dict[str, Any], model: str, path: Path) -> KannalaBrandt | Pinhole:
