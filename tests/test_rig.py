@@ -586,6 +586,10 @@ def test_a_wrong_rig_file_is_named(mine: Path, old: str, new: str, message: str)
             *("lidar/*", lambda path: path.write_bytes(re.sub(rb"(WIDTH|POINTS) \d+", rb"\1 0", path.read_bytes()))),
             r"\.pcd: a scan without points",
         ),
+        (
+            *("lidar/*", lambda path: path.rename(path.with_stem(f"{path.stem[:10]}_{path.stem[-9:]}"))),
+            r"lidar/1369730762_.*: its name seems to have seconds and nanoseconds apart",
+        ),
         ("masks/left.png", None, r"masks/left\.png: no such file"),
         ("masks/front.png", lambda path: shutil.copy(path.with_name("left.png"), path), r"front\.png: 128×128 pixels"),
         ("rig.json", b"{}", "found rig.toml and rig.json"),

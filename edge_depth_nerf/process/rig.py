@@ -274,6 +274,15 @@ def _number_in(path: Path) -> float:
     return float(numbers[-1])
 
 
+def _time_in(path: Path) -> float:
+    if re.search(r"(?<![0-9])[0-9]{9,10}[^0-9.][0-9]{9}$", path.stem):
+        raise InputError(
+            f"{path}: its name seems to have seconds and nanoseconds apart, of which the last number alone would be "
+            "the time. Rename the files to SECONDS.NANOSECONDS, or give a times_file."
+        )
+    return _number_in(path)
+
+
 def _timed(files: list[Path], clock: Clock, numbered: Numbered | None) -> list[_Timed]:
     """Files with their times, in the order of time."""
     if numbered is not None:
@@ -281,7 +290,7 @@ def _timed(files: list[Path], clock: Clock, numbered: Numbered | None) -> list[_
     elif clock.times_file is not None:
         times_s = clock.seconds(_times_of_file(clock.times_file, files, clock.time_unit))
     else:
-        times_s = clock.seconds([_number_in(path) for path in files])
+        times_s = clock.seconds([_time_in(path) for path in files])
     timed = sorted(map(_Timed, files, times_s), key=lambda item: item.time_s)
     for before, after in pairwise(timed):
         if before.time_s == after.time_s:
