@@ -134,6 +134,10 @@ def test_a_mask_hides_pixels_and_a_view_may_have_no_value(folder):
     given = {"maps": write_maps(folder, "relative"), "maps_kind": "relative"}
     found = np.load(run(folder, **given, mask=folder / "mask.png") / "distance/a.npy")
     assert (found[100:] == 0).all() and (found[:100][FOUND.within[:100]] > 0).mean() > 0.97
+    mask[60:] = 0
+    write_png(folder / "mask.png", mask)
+    found = np.load(run(folder, **given, mask=folder / "mask.png") / "distance/a.npy")
+    assert (found[60:] == 0).all() and found[:60].any()
     shutil.rmtree(folder / "out")
     np.save(folder / "maps/a_3.npy", np.full((VIEWS[0].height, VIEWS[0].width), np.nan, np.float32))
     found = np.load(run(folder, **given) / "distance/a.npy")
@@ -223,3 +227,9 @@ def test_the_command_with_a_ready_made_network(folder, monkeypatch, capsys):
     found = read_distance_png(folder / "out/distance/b.png")
     assert (found[FOUND.within] > 0).mean() > 0.97 and (found[~FOUND.within] == 0).all()
     assert "2 distance maps (metres" in capsys.readouterr().out
+    weights = folder / "network/model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-4] + bytes(4))
+    with pytest.raises(InputError, match=r"distance: holds other maps \(weights differs\)"):
+        fisheye_depth(
+            FisheyeDepthOptions(folder / "pictures", folder / "lens.toml", folder / "out", hf=str(folder / "network"))
+        )

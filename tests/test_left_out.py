@@ -128,6 +128,24 @@ def test_a_file_that_is_mended_comes_into_the_scene(drive: RoomDrive, file: str,
         run(drive)
 
 
+def test_a_mended_sweep_moves_the_split_and_no_held_out_sweep_stays_in_training_maps(drive: RoomDrive) -> None:
+    """With poses as they are given: nothing else is written anew."""
+    sweep = drive.root.parent / SWEEP.replace("07", "01")
+    whole = sweep.read_bytes()
+    sweep.write_bytes(whole[:-5])
+    given: dict[str, Any] = {"holdout_every": 5, "strict": False}
+    first, _ = run(drive, **given)
+    sweep.write_bytes(whole)
+    run(drive, **given)
+    fresh, _ = run(drive, "fresh", **given)
+    split = [read_json(each.scene / "transforms.json")["test_filenames"] for each in (first, fresh)]
+    assert split[0] == split[1]
+    found, expected = (contents(each.scene) for each in (first, fresh))
+    assert {
+        name for name in expected if name.startswith(("lidar/", "points")) and found[name] != expected[name]
+    } == set()
+
+
 def test_a_camera_without_pictures_for_training(drive: RoomDrive) -> None:
     """Those of a stretch may be missing; nothing is masked then."""
     for frame in drive.frames:

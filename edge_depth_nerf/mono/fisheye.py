@@ -26,6 +26,7 @@ from edge_depth_nerf.base.files import (
     read_image,
     read_mask,
     remove_leftovers,
+    sha256_of,
     write_atomically,
     write_distance_png,
     write_png,
@@ -38,7 +39,7 @@ from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.masks.lens import dark_rim
 from edge_depth_nerf.mono.elsewhere import agreed
 from edge_depth_nerf.mono.files import count_m, find_map, read_maps
-from edge_depth_nerf.mono.hf import load_ready_network, view_layers
+from edge_depth_nerf.mono.hf import load_ready_network, view_layers, weight_files
 from edge_depth_nerf.mono.options import FisheyeDepthOptions
 from edge_depth_nerf.mono.pinhole_views import PinholeView, pinhole_views
 from edge_depth_nerf.mono.relative import Kind, Layer
@@ -65,6 +66,8 @@ class Fisheyes:
     theta_max_rad: float
     mask: Bool[np.ndarray, "h w"] | None
     """What may be used."""
+    mask_file: Path | None = None
+    """Where that is from."""
 
     @property
     def views(self) -> tuple[PinholeView, ...]:
@@ -98,7 +101,8 @@ def fisheye_depth(options: FisheyeDepthOptions, console: Console | None = None) 
         open_folder(output, output / RECORD, _record(options, fisheyes), "views")
         remove_leftovers(output)
         if network is not None:
-            about = {"network": network.name, "kind": network.kind}
+            weights = {path.name: sha256_of(path) for path in weight_files(Path(str(options.hf)))}
+            about = {"network": network.name, "kind": network.kind, "weights": weights}
 
             def predicted(picture: Path) -> list[Layer]:
                 return view_layers(network, fisheyes.views, read_image(picture))
@@ -153,7 +157,7 @@ def open_fisheyes(options: FisheyeDepthOptions) -> Fisheyes:
         check_picture_size(path, lens)
     if not isinstance(lens, KannalaBrandt | Pinhole):
         lens = fit_kannala_brandt(lens, theta_max_rad).camera
-    return Fisheyes(pictures, lens, theta_max_rad, read_mask(options.mask) if options.mask else None)
+    return Fisheyes(pictures, lens, theta_max_rad, read_mask(options.mask) if options.mask else None, options.mask)
 
 
 def _record(options: FisheyeDepthOptions, fisheyes: Fisheyes) -> dict[str, Any]:
@@ -205,7 +209,8 @@ def _make(
     open_folder(output / DISTANCE, output / DISTANCE / MADE_OF, about, "maps")
     suffix = ".png" if kind == "metric" else ".npy"
     targets = {path: output / DISTANCE / f"{path.stem}{suffix}" for path in sources}
-    missing = [path for path, target in targets.items() if not _is_newer(target, [path, *sources[path]])]
+    masks = [] if fisheyes.mask_file is None else [fisheyes.mask_file]
+    missing = [path for path, target in targets.items() if not _is_newer(target, [path, *sources[path], *masks])]
     usable = fisheyes.usable() if missing else np.empty((0, 0), bool)
     with progress_bars(console, counted=True) as progress:
         for path in progress.track(missing, description="Distance maps"):

@@ -58,6 +58,11 @@ class ReadyNetwork:
         return maps
 
 
+def weight_files(folder: Path) -> list[Path]:
+    """The files of a network in a folder; none of one in Hugging Face's cache, which is named otherwise."""
+    return sorted(path for kind in ("*.json", "*.safetensors", "*.bin") for path in folder.glob(kind))
+
+
 def load_ready_network(name: str, output: HfOutput = "auto") -> ReadyNetwork:
     """Load a network from a folder that save_pretrained or a download made, or by name from Hugging Face's cache.
 

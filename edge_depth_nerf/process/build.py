@@ -290,8 +290,7 @@ class _Builder:
         for scene_camera in cameras:
             usable = lens_circle(scene_camera.original, options.theta_max_deg)
             self._usable[scene_camera.name] = usable if scene_camera.mask is None else usable & scene_camera.mask
-        as_recorded = options.poses == "recorded" and not options.refine_poses
-        self.found = [] if as_recorded else [self._keep_poses()]
+        self.found = self._keep_poses()
         self._lock = threading.Lock()
         self._coverage: dict[str, list[float]] = defaultdict(list)
         self._without: list[str] = []
@@ -308,7 +307,7 @@ class _Builder:
         self.layers = [layer for layer, there in present.items() if there]
 
     def _keep_poses(self) -> Path:
-        """Write down the poses that were found, and what is held out by them: other ones make other maps."""
+        """Write down the poses, and what is held out: other ones make other maps."""
         path = self._options.output / FOUND_POSES
         pictures, pose = self._recording.pictures, self._recording.pose
         poses = [[p.camera, p.frame, self._is_held_out(p), pose(p).tolist()] for p in pictures]
@@ -320,7 +319,7 @@ class _Builder:
         """Files that a picture's maps are made from."""
         sweeps = [sweep.path for sweep in self._store.used(picture.frame, picture.time_s)]
         ego = self._cameras[picture.camera].ego_mask
-        return (*picture.inputs, *sweeps, *self.found, *([] if ego is None else [ego]))
+        return (*picture.inputs, *sweeps, self.found, *([] if ego is None else [ego]))
 
     def content(self, picture: RecordedPicture) -> FrameContent:
         """Make the maps of one picture, at the scene's size."""

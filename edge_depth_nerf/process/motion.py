@@ -70,7 +70,7 @@ def add_motion(scene: SceneFolder, console: Console) -> None:
         return
     store = SphereSweepCache(scene.folder / ".cache" / "motion", scene, pictures, motion)
     run_jobs([partial(store.make, index) for index in range(len(pictures))], "Sweeping pictures", console)
-    run_jobs([partial(store.confirmed, index) for index in range(len(pictures))], "Confirming distances", console)
+    run_jobs([partial(store.confirm, index) for index in range(len(pictures))], "Confirming distances", console)
     numbers = {picture.name: index for index, picture in enumerate(pictures)}
     shares: list[float] = []
 
@@ -146,6 +146,10 @@ class SphereSweepCache:
 
     def _sweep(self, index: int) -> Swept:
         return _kept(self.folder / f"{index:06d}.npz", Swept, partial(self._motion.sweep, index))
+
+    def confirm(self, index: int) -> None:
+        """Confirm a picture's sweep, and keep that on disk alone."""
+        self.confirmed(index)
 
     def confirmed(self, index: int) -> MotionDistance:
         """What neighbours confirm of a picture's sweep; kept."""
