@@ -22,7 +22,8 @@ TrainedOn = Literal["scene", "elsewhere"]
 class EstimateDepthOptions:
     """Write monocular distance maps into scenes: from a network trained on their LiDAR, another network, or files.
 
-    Held-out pictures are never used for training. You can stop at any time; run the same command again to resume.
+    Held-out pictures are never used for training. If you stop a training, run the same command again to resume it; maps
+    begin again.
     """
 
     scenes: tyro.conf.Positional[tuple[Path, ...]]
