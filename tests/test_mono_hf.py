@@ -22,6 +22,7 @@ from edge_depth_nerf.mono.hf import load_ready_network, view_layers
 from edge_depth_nerf.mono.options import EstimateDepthOptions
 from edge_depth_nerf.mono.pinhole_views import PinholeView, pinhole_views
 from edge_depth_nerf.mono.relative import Layer, Line, Samples, blend, fit_lines, take_samples
+from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import ScenePicture, read_scene
 
 pytestmark = pytest.mark.slow
@@ -242,6 +243,30 @@ def test_a_map_that_runs_the_wrong_way_is_told(tmp_path, is_said, kind):
 
     with pytest.raises(InputError, match=rf"rank correlation.*not {kind}. Declare it {is_said}"):
         list(FittedMaps(scene, kind, layers))
+
+
+def test_one_odd_picture_has_no_map_and_ends_no_run(tmp_path):
+    """A network fails on the fifth; what it finds in the eighth is all sky."""
+    folder = write_scene(tmp_path, [scaled_lens(FISHEYE, (60, 60))], frames=20, mono=False)
+    scene = read_scene(folder)
+
+    def layers(picture: ScenePicture) -> list[Layer]:
+        found = scene.rays(picture)
+        distance = seen_in_the_ball(picture, found.directions)
+        values = distance if picture is scene.pictures[4] else 1 / distance
+        return [Layer((slice(0, 60), slice(0, 60)), values, np.ones((60, 60)), found.within.astype(float))]
+
+    maps = [(picture, metres) for picture, metres in FittedMaps(scene, "inverse", layers)]
+    assert [picture.frame for picture, metres in maps if not metres.any()] == [4]
+    named = [(picture.name, 1e4 if number == 7 else metres) for number, (picture, metres) in enumerate(maps)]
+    source = {"trained_on": "elsewhere"}
+    given = [(name, np.broadcast_to(metres, (60, 60))) for name, metres in named]
+    assert write_maps(folder, "mono", given, source) == [scene.pictures[4].name, scene.pictures[7].name]
+    assert read_scene(folder).has("mono")
+    # three of twenty are too many
+    given[9] = (given[9][0], np.zeros((60, 60)))
+    with pytest.raises(InputError, match=rf"{scene.pictures[4].name}: its monocular map .* as 3 of the first 10\."):
+        write_maps(folder, "mono", given, source)
 
 
 # ---- networks from disk -------------------------------------------------------------------------------------------

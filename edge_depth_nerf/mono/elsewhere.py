@@ -60,6 +60,7 @@ class FittedMaps:
         """Give H×W metres along the ray of all pictures; those with few LiDAR points come last."""
         waiting: list[ScenePicture] = []
         drive: dict[str, list[Samples]] = {}
+        right, wrong = 0, list[InputError]()
         for picture in self.scene.pictures:
             if self.kind == "metric":
                 layers, samples = self._seen(picture)
@@ -70,10 +71,19 @@ class FittedMaps:
                 waiting.append(picture)
                 continue
             layers, samples = seen
-            self._check_direction(picture, samples)
+            if (fault := self._wrong_way(picture, samples)) is not None:
+                # a network may fail on one picture: that has no map then
+                wrong.append(fault)
+                if len(wrong) > max(right, 2):
+                    raise wrong[0]
+                yield picture, np.zeros((picture.lens.height, picture.lens.width), np.float32)
+                continue
+            right += 1
             if not picture.held_out:
                 drive.setdefault(picture.camera, []).append(_thinned(samples))
             yield picture, self._blended(picture, layers, fit_lines(samples, self.kind))
+        if wrong and len(wrong) >= right:
+            raise wrong[0]
         if waiting and not self.scene.split_known:
             raise InputError(
                 f"{self.scene.path}: {waiting[0].name} has fewer than {LEAST_POINTS} LiDAR points, so its map "
@@ -112,7 +122,7 @@ class FittedMaps:
     ) -> Float32[np.ndarray, "h w"]:
         return blend(layers, lines, self.kind, (picture.lens.height, picture.lens.width))
 
-    def _check_direction(self, picture: ScenePicture, samples: Samples) -> None:
+    def _wrong_way(self, picture: ScenePicture, samples: Samples) -> InputError | None:
         """Find depth that is declared disparity, or the other way round."""
         lidar_points = np.flatnonzero(samples.lidar_m > 0)
         best = np.where(samples.seen, samples.weight, -1)[:, lidar_points].argmax(0)
@@ -120,12 +130,14 @@ class FittedMaps:
         known = np.isfinite(values)
         z = (samples.lidar_m[lidar_points] * cosine)[known]
         found = rank_correlation(values[known], z) * (-1 if self.kind == "inverse" else 1)
-        if found < WRONG_WAY:
-            other = "relative (or metric)" if self.kind == "inverse" else "inverse"
-            raise InputError(
-                f"{picture.name}: its map {'rises' if self.kind == 'inverse' else 'falls'} where LiDAR's distance "
-                f"rises (rank correlation {abs(found):.2f}), so it is not {self.kind}. Declare it {other}."
-            )
+        # without a correlation nothing is known
+        if not found < WRONG_WAY:
+            return None
+        other = "relative (or metric)" if self.kind == "inverse" else "inverse"
+        return InputError(
+            f"{picture.name}: its map {'rises' if self.kind == 'inverse' else 'falls'} where LiDAR's distance rises "
+            f"(rank correlation {abs(found):.2f}), so it is not {self.kind}. Declare it {other}."
+        )
 
 
 def agreed(layers: Sequence[Layer], usable: Bool[np.ndarray, "h w"], kind: Kind) -> Float32[np.ndarray, "h w"]:

@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from edge_depth_nerf import __version__
-from edge_depth_nerf.base.console import progress_bars
+from edge_depth_nerf.base.console import progress_bars, say
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.one_writer import only_writer
 from edge_depth_nerf.masks.sky import find_sky
@@ -188,7 +188,8 @@ def _write_own(
             # weights of before have them by the scenes' names
             seen = frames.get(_key(scene), frames.get(_name(scene), []))
             source["trained_frames"] = seen
-            write_maps(scene.folder, "mono", predicted_maps(network, scene), source, progress)
+            empty = write_maps(scene.folder, "mono", predicted_maps(network, scene), source, progress)
+            _say_empty(scene, empty, console)
 
 
 def _write_predicted(network: ReadyNetwork, scenes: Sequence[SceneFolder], console: Console) -> None:
@@ -227,7 +228,7 @@ def _write_fitted(every: Sequence[FittedMaps], source: dict[str, Any], console: 
     with progress_bars(console) as progress:
         for fitted in every:
             maps = ((picture.name, without_sky(fitted.scene, picture, metres, metres)) for picture, metres in fitted)
-            write_maps(fitted.scene.folder, "mono", maps, source, progress)
+            _say_empty(fitted.scene, write_maps(fitted.scene.folder, "mono", maps, source, progress), console)
     for fitted in every:
         if few := fitted.by_the_drive:
             console.print(
@@ -235,6 +236,12 @@ def _write_fitted(every: Sequence[FittedMaps], source: dict[str, Any], console: 
                 f"{LEAST_POINTS} LiDAR points to fit to, such as {few[0]}; they use the drive's fit",
                 soft_wrap=True,
             )
+
+
+def _say_empty(scene: SceneFolder, names: Sequence[str], console: Console) -> None:
+    if names:
+        what = f"{len(names)} pictures get no monocular map, such as {names[0]}: nothing in it can be used."
+        say(console, f"{scene.folder}: {what}", "yellow")
 
 
 # ---- training --------------------------------------------------------------------------------------------------

@@ -21,6 +21,8 @@ from edge_depth_nerf.base.files import write_distance_png, write_json
 from edge_depth_nerf.scene.format import CALIBRATION_FILE, LAYERS, later_layers, read_transforms
 from edge_depth_nerf.scene.reader import SceneFolder, ScenePicture, read_scene
 
+MOST_EMPTY = 0.1
+"""A larger share of maps without any value is a mistake."""
 FARTHEST_M = 200.0
 """What an estimate puts beyond is the sky, or as good as that: no value."""
 
@@ -32,7 +34,7 @@ def write_maps(
     source: Mapping[str, Any],
     progress: Progress | None = None,
     some_empty: bool = False,
-) -> None:
+) -> list[str]:
     """Write a map of a source of depth for every frame of a scene, and name them in its transforms.json.
 
     Values that are not finite, not positive, beyond 200 m, outside the lens or hidden by the camera's mask are written
@@ -47,12 +49,15 @@ def write_maps(
             "trained_on", what their maker has seen: "scene" for a network that was trained on LiDAR and knows nothing
             beyond the scanner's field, "elsewhere" for others. They are not aligned to LiDAR.
         progress: where to show how far it is.
-        some_empty: a map may have no value at all, as one from motion where nothing moved.
+        some_empty: maps may have no value at all, as those from motion where nothing moved; else a tenth of them may.
+
+    Returns:
+        The names of frames whose maps have no value.
 
     Raises:
         FileNotFoundError: no scene there.
-        InputError: no such source; a map has another size than its camera, no value at all, or is of no frame; frames
-            without a map; "trained_on" is missing.
+        InputError: no such source; a map has another size than its camera, or is of no frame; too many have no value;
+            frames without a map; "trained_on" is missing.
     """
     if layer not in later_layers():
         raise InputError(f"{layer!r} is no source of depth; expected one of {', '.join(later_layers())}.")
@@ -73,14 +78,22 @@ def write_maps(
     shutil.rmtree(partial, ignore_errors=True)
     task = progress.add_task(f"Writing {words}s of {found.folder.name}", total=len(pictures)) if progress else None
     written: set[str] = set()
+    empty: list[str] = []
     try:
         for name, metres in maps:
             if name not in pictures or name in written:
                 fault = "is of no frame of" if name not in pictures else "comes twice for"
                 raise InputError(f"{name}: a {words} {fault} {found.path}. Give one for every file_path in it.")
-            metres = _usable(found, pictures[name], metres, words, some_empty)
+            metres, is_empty = _usable(found, pictures[name], metres, words)
             write_distance_png(partial / targets[name], metres)
             written.add(name)
+            empty += [name] * is_empty
+            # the first three tell of another unit before hours of work
+            if not some_empty and len(empty) > (0 if len(empty) == len(written) > 2 else MOST_EMPTY * len(pictures)):
+                raise InputError(
+                    f"{empty[0]}: its {words} has no distance between 0 and {FARTHEST_M:g} m anywhere in the mask, as "
+                    f"{len(empty)} of the first {len(written)}. Expected metres along the ray."
+                )
             if progress and task is not None:
                 progress.advance(task)
         if missing := sorted(pictures.keys() - written):
@@ -104,12 +117,16 @@ def write_maps(
         frame[LAYERS[layer].key] = targets[frame["file_path"]]
     meta[layer] = dict(source)
     write_json(found.path, meta)
+    return empty
 
 
 def _usable(
-    scene: SceneFolder, picture: ScenePicture, metres: Float[np.ndarray, "h w"], words: str, may_be_empty: bool
-) -> Float[np.ndarray, "h w"]:
-    """Leave out of a map what is no distance to anything, or outside the lens and the mask; errors call it `words`."""
+    scene: SceneFolder, picture: ScenePicture, metres: Float[np.ndarray, "h w"], words: str
+) -> tuple[Float[np.ndarray, "h w"], bool]:
+    """Leave out of a map what is no distance to anything, or outside the lens and the mask; errors call it `words`.
+
+    Also whether nothing is left of it although something may be used.
+    """
     size = (picture.lens.width, picture.lens.height)
     if metres.shape != size[::-1]:
         raise InputError(
@@ -119,12 +136,7 @@ def _usable(
     usable = scene.usable(picture)
     # comparisons with NaN are false
     kept = usable & (metres > 0) & (metres <= FARTHEST_M)
-    if usable.any() and not kept.any() and not may_be_empty:
-        raise InputError(
-            f"{picture.name}: its {words} has no distance between 0 and {FARTHEST_M:g} m anywhere in the mask. "
-            "Expected metres along the ray."
-        )
-    return np.where(kept, metres, 0.0)
+    return np.where(kept, metres, 0.0), bool(usable.any() and not kept.any())
 
 
 def _target(layer: str, picture: ScenePicture) -> str:
