@@ -252,6 +252,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], Any], dict[str, Any]]] = {
 
 REFUSED: dict[str, str] = {
     "mono of nothing": "no training pixel has a depth prior",
+    "all at 4 mm": "no depth prior is between the near plane",
     "a metre is a world": "metres-per-unit",
     "far plane at 1e9 m": "far-m",
 }

@@ -118,7 +118,7 @@ class EdgeDepthPipeline(VanillaPipeline):
                 "estimate-depth`, or train without a prior with --pipeline.model.depth-loss none."
             )
         if model.depth_loss != "none" and sampler is not None:
-            prior_m = sampler.table.batch(0, min(_LOOKED_AT, len(sampler.table))).prior_distance_m
+            prior_m = sampler.table.batch(0, _LOOKED_AT).prior_distance_m
             prior_m = prior_m[prior_m > 0]
             if len(prior_m) and not ((prior_m >= model.near_m) & (prior_m <= model.far_m)).any():
                 raise InputError(
