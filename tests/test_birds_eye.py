@@ -1,5 +1,6 @@
 """The road from above: rendered of a yard whose every distance is known in closed form."""
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,11 @@ from drives import ROOM, SEQUENCE, RoomDrive, write_room_drive
 from PIL import Image
 from rich.console import Console
 from scenes import write_scene
-from trainings import write_config
+from trainings import trainer_of, write_config
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_json, write_json
-from edge_depth_nerf.films import birds_eye
+from edge_depth_nerf.films import birds_eye, scanning
 from edge_depth_nerf.films.birds_eye import render_birds_eye
 from edge_depth_nerf.films.ground_plan import GroundPlan, driven_path
 from edge_depth_nerf.films.options import BirdsEyeOptions
@@ -101,6 +102,24 @@ def of_the_yard(scene) -> Iterator[None]:
         # the yard has no networks: lengths are its outputs, too
         patch.setattr(Caster, "_lengths", lambda caster, rays: caster._model.get_outputs_for_camera_ray_bundle(rays))
         yield
+
+
+def test_a_training_that_was_moved_is_loaded_from_anywhere(tmp_path, monkeypatch):
+    """Its config.yml has a path relative to where it was trained."""
+    scene = write_scene(tmp_path / "scene", frames=3)
+    monkeypatch.chdir(tmp_path)
+    trainer = trainer_of(scene, Path("runs"))
+    trainer.config.save_config()
+    trainer.save_checkpoint(3)
+    run = Path(shutil.move(trainer.base_dir, tmp_path / "moved"))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    loaded = scanning.load_model(Path("../moved/config.yml"), scene)
+    expected = trainer.pipeline.model.state_dict()
+    assert all(torch.equal(value, expected[name]) for name, value in loaded.state_dict().items())
+    (run / "nerfstudio_models/step-000000003.ckpt").write_bytes(b"half")
+    with pytest.raises(InputError, match="nerfstudio_models: has no whole checkpoint"):
+        scanning.check_checkpoint(Path("../moved/config.yml"))
 
 
 @pytest.fixture

@@ -262,16 +262,18 @@ def test_poses_turn_about_x_then_y_then_z(tmp_path: Path) -> None:
     np.testing.assert_array_equal(poses[0][:3, 3], 0)
 
 
+@pytest.mark.parametrize("lost", [0, 2])
 @pytest.mark.parametrize("empty", [False, True])
-def test_frames_without_sweep_keep_the_others_times(raw: Path, tmp_path: Path, empty: bool) -> None:
+def test_frames_without_sweep_keep_the_others_times(raw: Path, tmp_path: Path, empty: bool, lost: int) -> None:
     """Some of KITTI's drives lack sweeps, and their lines of times are empty."""
     root = Path(shutil.copytree(raw, tmp_path / "raw"))
     scans = root / f"{DRIVE[:10]}/{DRIVE}/velodyne_points"
-    (scans / "data/0000000002.bin").unlink()
+    (scans / f"data/{lost:010d}.bin").unlink()
     lines = (scans / "timestamps.txt").read_text().splitlines(keepends=True)
-    (scans / "timestamps.txt").write_text("".join([*lines[:2], "\n" if empty else lines[2], *lines[3:]]))
+    (scans / "timestamps.txt").write_text("".join([*lines[:lost], "\n" if empty else lines[lost], *lines[lost + 1 :]]))
     recording = read_kitti(options(root))
-    assert [sweep.time_s - FIRST_S for sweep in recording.sweeps] == pytest.approx([0, 0.1, 0.3, 0.4, 0.5], abs=1e-6)
+    expected = [number / 10 for number in range(6) if number != lost]
+    assert [sweep.time_s - FIRST_S for sweep in recording.sweeps] == pytest.approx(expected, abs=1e-6)
     front = [each.time_s - FIRST_S for each in recording.pictures if each.camera == "image_02"]
     assert front == pytest.approx(np.arange(6) / 10, abs=1e-6)
 

@@ -179,7 +179,8 @@ def read_times(path: Path, unit: str = "s") -> list[tuple[str | None, float]]:
 def read_frame_times(path: Path, otherwise: str = "") -> list[float]:
     """Read the times of a data set's frames, a line each; `otherwise`: what else to do than to copy the file again.
 
-    The line of a lost frame is empty, as in some of KITTI's drives. It gets a time between its neighbours.
+    The line of a lost frame is empty, as in some of KITTI's drives. It gets a time between its neighbours'; before the
+    first one, the usual interval counts.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -192,8 +193,11 @@ def read_frame_times(path: Path, otherwise: str = "") -> list[float]:
                 f"{path}, line {line}: not after the line before. Copy the file again from the data set{otherwise}."
             )
     lines = [line for line, _ in _lines(path)]
-    every = np.arange(1, lines[-1] + 1) if lines else np.zeros(0)
-    return np.interp(every, lines, times_s).tolist() if lines else []
+    if not lines or lines[-1] == len(lines):
+        return times_s
+    every = np.arange(1, lines[-1] + 1)
+    interval_s = float(np.median(np.diff(times_s) / np.diff(lines))) if len(lines) > 1 else 0.0
+    return (np.interp(every, lines, times_s) + interval_s * np.minimum(every - lines[0], 0)).tolist()
 
 
 def _time_of_line(words: list[str], first: str, where: str) -> tuple[str, str | None, float]:

@@ -89,7 +89,8 @@ def write_maps(
             written.add(name)
             empty += [name] * is_empty
             # the first three tell of another unit before hours of work
-            if not some_empty and len(empty) > (0 if len(empty) == len(written) > 2 else MOST_EMPTY * len(pictures)):
+            no_unit = len(empty) == len(written) == 3
+            if not some_empty and (no_unit or len(empty) > MOST_EMPTY * len(pictures)):
                 raise InputError(
                     f"{empty[0]}: its {words} has no distance between 0 and {FARTHEST_M:g} m anywhere in the mask, as "
                     f"{len(empty)} of the first {len(written)}. Expected metres along the ray."
