@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -160,7 +161,9 @@ def distances(scene: Path) -> set[float]:
     return {float(value) for f in frames for value in np.unique(read_distance_png(scene / f["mono_file_path"]))} - {0.0}
 
 
-def test_maps_that_are_brought_stay_until_others_are_put_in_whole(room: RoomDrive, tmp_path: Path) -> None:
+def test_maps_that_are_brought_stay_until_others_are_put_in_whole(
+    room: RoomDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene, mono = tmp_path / "scene", write_mono(tmp_path / "mono", room, 9.0)
     options = options_of(room, scene, mono=mono, sky=False)
     assert "Error of the monocular maps" in run(options)
@@ -180,8 +183,11 @@ def test_maps_that_are_brought_stay_until_others_are_put_in_whole(room: RoomDriv
     run(options)
     assert distances(scene) == {3.0}
     assert read_json(scene / "transforms.json")["mono"] == {"trained_on": "elsewhere"}
-    # one file renewed: all are the drive's again, none is mixed in
+    # one file renewed: all are the drive's again, none is mixed in; a run that is stopped leaves this to be said
     (mono / "image_02/0000000002.png").touch()
+    with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
+        stopped.setattr("edge_depth_nerf.scene.writer.run_jobs", Mock(side_effect=KeyboardInterrupt))
+        run(options)
     assert "of this scene are removed" in run(options)
     assert distances(scene) == {9.0} and "mono" not in read_json(scene / "transforms.json")
 

@@ -82,6 +82,8 @@ CLOUD = "cloud"
 MAX_FIT_RMS_PX = 0.5
 """A camera whose replacement is off by more than this cannot be used."""
 _PARTIAL = ".partial"
+_BEFORE = ".transforms.before.json"
+"""The scene's transforms.json while its maps are being replaced; a run that is stopped leaves it to the next one."""
 
 DistanceMap = Path | NDArray[np.float32] | NDArray[np.float64]
 Picture = Path | NDArray[np.uint8]
@@ -284,7 +286,8 @@ def write_scene(
     ]
     if jobs:
         # a reader is not to find a scene whose maps are being replaced
-        (output / TRANSFORMS).unlink(missing_ok=True)
+        if (output / TRANSFORMS).is_file():
+            (output / TRANSFORMS).replace(output / _BEFORE)
         run_jobs(jobs, "Writing the scene", console)
     left_out = {(item.camera, item.frame) for item in tolerance.left_out}
     frames = [frame for frame in frames if (frame.camera, frame.frame) not in left_out]
@@ -305,6 +308,7 @@ def write_scene(
             frame[LAYERS[name].key] = files[frame["file_path"]]
     _keep_left_out(output, tolerance)
     write_json(output / TRANSFORMS, content)
+    (output / _BEFORE).unlink(missing_ok=True)
     shutil.rmtree(output / _PARTIAL, ignore_errors=True)
 
     held_out = sum(frame.held_out for frame in frames)
@@ -697,8 +701,11 @@ def _kept_later_maps(
     Of the maps, by layer, it gives where they come from, and the file of each picture's.
     """
     work, notices, kept = _pending(output, frames, shifted, layers), [], {}
-    fresh = not (work.frames or work.shifted)
-    there = read_transforms(output / TRANSFORMS) if (output / TRANSFORMS).is_file() else {}
+    path = output / TRANSFORMS
+    fresh = path.is_file() and not (work.frames or work.shifted)
+    if not path.is_file():
+        path = output / _BEFORE
+    there = read_transforms(path) if path.is_file() else {}
     for name in filter(later_layers().__contains__, there):
         files = {frame["file_path"]: frame.get(LAYERS[name].key) for frame in there["frames"]}
         needed = [files.get(_frame_files(frame, ())["image"]) for frame in frames]
