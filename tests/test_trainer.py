@@ -206,12 +206,13 @@ def test_a_relative_scene_is_said_to_be_relative(trainer, tmp_path, monkeypatch)
         ("pipeline.model.near_plane", 1.0, "--pipeline.model.near-plane has no effect: use --pipeline.model.near-m"),
         ("pipeline.datamanager.pixel_sampler.ignore_mask", True, "pixel-sampler.ignore-mask has no effect: leave it"),
         ("pipeline.datamanager.patch_size", 4, "--pipeline.datamanager.patch-size has no effect: leave it out"),
+        ("pipeline.model.background_color", "white", "leave it out, or add --pipeline.model.depth-loss none"),
     ],
 )
 def test_settings_without_effect_are_refused(trainer, name, value, said):
     config = deepcopy(all_methods["edge-depth-nerf-lite"])
     config.pipeline.datamanager.data = trainer.config.pipeline.datamanager.data
-    check_effect(config._changed())
+    check_effect(config._changed(), has_sky=True)
     apply_overrides(config, {name: value}, "test")
     with pytest.raises(InputError, match=said):
         config.save_config()

@@ -118,6 +118,11 @@ class ModelOptions:
     """Add detail of the training pictures to rendered views, which then take longer; training stays the same
     (docs/method.md)."""
 
+    @property
+    def has_sky(self) -> bool:
+        """Whether the sky is behind what samples stop."""
+        return self.depth_loss != "none" and self.sky_background
+
     def check(self) -> None:
         """Raise an InputError if an option is out of its range."""
         near_m, far_m = self.near_m, self.far_m
@@ -199,7 +204,7 @@ class EdgeDepthNerfModel(NerfactoModel):
         self.config = replace(self.config, implementation="torch")
         if self.config.exposure != "embedding":
             self.config.use_appearance_embedding = False
-        self._has_sky = self.config.depth_loss != "none" and self.config.sky_background
+        self._has_sky = self.config.has_sky
         if self._has_sky:
             # nothing is added to what samples stop; the sky's colour is the field's
             self.config.background_color = "black"

@@ -30,6 +30,8 @@ WITHOUT_EFFECT = {
     ),
 }
 """nerfstudio's options that nothing here reads, and what to do instead."""
+WITHOUT_EFFECT_BESIDE_SKY = {"pipeline.model.background_color": "leave it out, or add --pipeline.model.depth-loss none"}
+"""As `WITHOUT_EFFECT`, where the sky is behind everything."""
 
 
 def flattened(config: Any, prefix: str = "") -> dict[str, Any]:
@@ -56,12 +58,13 @@ def changed_settings(config: Any, usual: Any) -> dict[str, Any]:
     }
 
 
-def check_effect(changed: Iterable[str]) -> None:
+def check_effect(changed: Iterable[str], has_sky: bool) -> None:
     """Raise an InputError if some of the changed settings have no effect."""
+    without_effect = WITHOUT_EFFECT | (WITHOUT_EFFECT_BESIDE_SKY if has_sky else {})
     found = [
         f"--{name.replace('_', '-')} has no effect: {instead}"
         for name in changed
-        for option, instead in WITHOUT_EFFECT.items()
+        for option, instead in without_effect.items()
         if name == option or name.startswith(f"{option}.")
     ]
     if found:

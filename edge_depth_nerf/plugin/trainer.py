@@ -35,6 +35,7 @@ from edge_depth_nerf.plugin.compat import ignore_deprecations_of_host, total_ste
 from edge_depth_nerf.plugin.datamanager import FisheyeDepthDataManager
 from edge_depth_nerf.plugin.dataparser import FisheyeDepthDataParserConfig, transforms_path
 from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
+from edge_depth_nerf.plugin.model import ModelOptions
 from edge_depth_nerf.plugin.pipeline import EdgeDepthPipeline, NotFiniteError
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
 from edge_depth_nerf.plugin.settings import changed_settings, check_effect
@@ -87,7 +88,8 @@ class EdgeDepthTrainerConfig(TrainerConfig, TrainingOptions):
         """
         say_errors_plainly()
         ignore_deprecations_of_host()
-        check_effect(self._changed())
+        model = self.pipeline.model
+        check_effect(self._changed(), isinstance(model, ModelOptions) and model.has_sky)
         if self.machine.device_type == "cuda" and not torch.cuda.is_available():
             raise InputError(
                 "--machine.device-type cuda: torch finds no GPU here (`edge-depth-nerf doctor` says why). Add "
