@@ -153,13 +153,16 @@ def test_ctrl_c_ends_what_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_workers_are_not_lost_for_ever(tmp_path: Path) -> None:
-    task = steps(tmp_path, "a", 60.0)
+def test_workers_are_not_lost_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    task, console = steps(tmp_path, "a", 60.0), Console(file=io.StringIO(), width=200)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     kill_worker_of("a.kept", lambda: True)
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),
-        on_cluster("local", [task], [], QUIET) as place,
+        on_cluster("local", [task], [], console) as place,
     ):
+        # one task has all cores
+        assert f"threads of each: {dask.system.cpu_count()}" in console.file.getvalue()  # pyrefly: ignore
         with pytest.raises(InputError, match=r"a: 1 worker was lost.*logs/a\.log"):
             do_tasks([task], place, QUIET)
 

@@ -17,7 +17,7 @@ from edge_depth_nerf.compare import tables
 from edge_depth_nerf.compare.plots import draw_plots
 from edge_depth_nerf.compare.report import _of_drive
 from edge_depth_nerf.compare.results import Results, RunResult, check_fair
-from edge_depth_nerf.report.tables import latex_of_tables, page_of_tables, show_tables
+from edge_depth_nerf.report.tables import Cell, MadeTable, Row, latex_of_tables, page_of_tables, show_tables
 
 PSNR_OF = {
     ("street", "nerfacto"): (20.0, 21.0, 22.5),
@@ -242,6 +242,12 @@ def test_latex_and_markdown_hold_the_same_cells(results):
         columns = len(rows[: rows.index("\n")].strip("{}"))
         cells = [line for line in rows.splitlines() if line.endswith(r"\\") and "multicolumn" not in line]
         assert {line.count(" & ") + 1 for line in cells} == {columns}
+
+
+def test_a_name_of_a_drive_does_not_break_its_table():
+    made = MadeTable("1", "Rivals", [("loop|2 x^2~y", ["PSNR"])], [Row("nerfacto", [Cell(20.0, None, ".2f")])])
+    assert r"| | loop\|2 x^2~y PSNR |" in page_of_tables("Comparison", [], [made])
+    assert r"loop|2 x\^{}2\textasciitilde{}y" in latex_of_tables([], [made])
 
 
 def test_tables_say_whose_the_monocular_maps_are(results):

@@ -112,7 +112,11 @@ def test_what_is_there_is_not_done_again(finished, monkeypatch, capsys):
     written = {path: path.stat().st_mtime_ns for path in options.output.rglob("*") if path.is_file()}
     again = demo.run_demo(options, Console(width=200))
     assert again == results
-    assert written == {path: path.stat().st_mtime_ns for path in options.output.rglob("*") if path.is_file()}
+    files = [path for path in options.output.rglob("*") if path.is_file()]
+    scene = options.output / "scenes" / "parking"
+    # the drive is looked at, and these written as they were
+    same = {scene / "transforms.json", *(scene / "masks").iterdir()}
+    assert {path for path in files if written.get(path) != path.stat().st_mtime_ns} == same
     said = capsys.readouterr().out
     assert f"{results['figures']['ours']['truth_masked_psnr']:.2f}" in said
     assert results["viewer_commands"][1] in said
@@ -162,6 +166,7 @@ def test_a_recording_of_ones_own(recording, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(comparing, "check_scene", lambda folder, *_: read_scene(folder))
     monkeypatch.setattr(demo, "process", lambda given, console: convert(replace(given, refine_poses=False), console))
     monkeypatch.chdir(tmp_path)
+    recording = copied(recording, tmp_path / "my drive")
     results = demo.run_demo(DemoOptions(real=recording, frames=5, steps=9), Console(width=200))
     page = (tmp_path / "outputs/demo_my drive/report.html").read_text(encoding="utf-8")
     assert "<h1>Demo: nerfacto and ours on my drive</h1>" in page
@@ -172,6 +177,14 @@ def test_a_recording_of_ones_own(recording, tmp_path, monkeypatch, capsys):
     assert typed[1] == cli.Process(RigOptions(root=recording, output=scene, frames=5))
     assert len(read_json(scene / "transforms.json")["frames"]) == 5 * 3
     assert "file:///" in capsys.readouterr().out
+    # the same by another path; and another one in its place
+    Path("outputs/demo_my drive/report.html").unlink()
+    assert demo.run_demo(DemoOptions(real=Path("my drive"), frames=5, steps=9), QUIET)["figures"] == results["figures"]
+    assert Path("outputs/demo_my drive/report.html").is_file()
+    rig = recording / "rig.toml"
+    rig.write_text(re.sub(r"(?m)^fx = .*", "fx = 99.0", rig.read_text()))
+    with pytest.raises(InputError, match="another scene"):
+        demo.run_demo(DemoOptions(real=recording, frames=5, steps=9), QUIET)
 
 
 def test_a_recording_is_checked_before_long_work(recording, tmp_path, monkeypatch):
@@ -189,6 +202,12 @@ def test_a_recording_is_checked_before_long_work(recording, tmp_path, monkeypatc
     ):
         with pytest.raises((InputError, FileNotFoundError), match=message):
             demo.run_demo(DemoOptions(real=root, frames=frames), QUIET)
+    for changes, message in (
+        ({"frames": -5}, "--frames -5: expected 1 or more"),
+        ({"size": 512}, "--size is of rendered"),
+    ):
+        with pytest.raises(InputError, match=message):
+            demo.run_demo(replace(DemoOptions(real=recording), **changes), QUIET)
     assert not Path("outputs").exists()
 
 

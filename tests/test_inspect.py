@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -349,6 +350,12 @@ def without(*keys: str):
     return mend
 
 
+def of_motion_alone(meta):
+    for frame in meta["frames"]:
+        frame["motion_file_path"] = frame.pop("mono_file_path")
+        del frame["lidar_file_path"]
+
+
 POSES_AND_LISTS = [
     (shift_from(5, 4.8), "gap", ("left",), (4, 5), "Frames 4 and 5 are 5.3 m apart, 11 times the usual 0.5 m"),
     (turn_from(9, 30), "turn", ("left",), (8, 9), "From frame 8 to 9 the camera turns by 30 degrees"),
@@ -359,6 +366,7 @@ POSES_AND_LISTS = [
     (without("lidar_file_path"), "no_lidar", (), (), "no LiDAR"),
     (without("mono_file_path"), "no_mono", (), (), "--mono"),
     (without("mono_file_path", "lidar_file_path", "frame"), "no_prior", (), (), "plain nerfacto"),
+    (of_motion_alone, "no_prior", (), (), "distances from motion alone"),
     (without("mask_path"), "no_mask", (), (), "--ego-mask"),
     (without("ply_file_path"), "no_points", (), (), "ply_file_path"),
     (lambda meta: meta["frames"][3].pop("mono_file_path"), "incomplete", (), (), "mono_file_path is given for 11 of"),
@@ -478,13 +486,32 @@ def test_long_drives_are_sampled_evenly(tmp_path, numbers, cameras, measured):
 
 def test_a_second_look_says_that_it_is_of_a_sample_and_leaves_no_sheets_of_the_first(tmp_path, monkeypatch):
     drive, output = write_drive(tmp_path / "drive", 3), tmp_path / "out"
-    assert len(look(drive, output, frames=50)["sheets"]) == 3
-    (output / "notes.png").write_bytes(b"mine")
+    with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
+        stopped.setattr("edge_depth_nerf.inspecting.command.check_poses", Mock(side_effect=KeyboardInterrupt))
+        look(drive, output, frames=50)
+    for name in ("notes.png", "poses.png"):
+        (output / name).write_bytes(b"mine, or of poses that are not checked any more")
     monkeypatch.setattr(figures, "MEASURED_PICTURES", 2)
     summary = look(drive, output, frames=1)
     assert summary["measured"] == "measured on 2 of the 3 pictures, evenly over the drive"
     assert summary["maps"]["measured_pictures"] == len(summary["frames"]) == 2 and len(summary["sheets"]) == 1
     assert {path.name for path in output.iterdir()} == {*summary["sheets"], "top_view.png", "summary.json", "notes.png"}
+
+
+def test_a_slow_camera_is_in_no_sample_and_each_has_sheets_of_its_own(tmp_path, monkeypatch):
+    drive = write_drive(tmp_path / "drive", 5)
+
+    def three_cameras(meta):
+        for frame, camera in ((1, "\u5f8c 2"), (2, "\u5f8c_2")):
+            meta["frames"][frame] |= {"camera": camera, "frame": 0}
+
+    change(drive, three_cameras)
+    sheets = look(drive, tmp_path / "out", frames=50)["sheets"]
+    assert len({*sheets}) == len([*(tmp_path / "out").glob("*_0*.png")]) == 5
+    change(drive, lambda meta: [meta["frames"][n].update(frame=n) for n in (1, 2)])
+    monkeypatch.setattr(figures, "MEASURED_PICTURES", 2)
+    cameras = look(drive, tmp_path / "out", frames=1)["cameras"]
+    assert [camera["prior_share"] is None for camera in cameras.values()] == [False, True, True]
 
 
 @pytest.mark.parametrize(

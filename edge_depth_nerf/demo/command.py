@@ -17,7 +17,7 @@ import torch
 from rich.console import Console
 
 from edge_depth_nerf.base.console import say, told
-from edge_depth_nerf.base.errors import InputError
+from edge_depth_nerf.base.errors import InputError, require
 from edge_depth_nerf.base.files import check_is_folder, read_json, write_bytes, write_json
 from edge_depth_nerf.compare.command import RUNS, finished_runs, picture_name, read_comparison, write_comparison
 from edge_depth_nerf.compare.methods import METHODS, MethodName
@@ -81,6 +81,10 @@ def stages_of(options: DemoOptions) -> Stages:
         synthesis = SynthesizeOptions(output=drive, scene=options.scene, frames=frames, size=options.size)
         processing = Kitti360Options(root=drive, sequence=synthesis.sequence, output=scene)
     else:
+        unused = [name for name in ("scene", "size") if getattr(options, name) != getattr(DemoOptions, name)]
+        if unused:
+            raise InputError(f"--{unused[0]} is of rendered drives: leave it out with --real.")
+        require(frames is None or frames > 0, f"--frames {frames}", "1 or more")
         synthesis = None
         processing = options_of(options.real, scene, RECORDED_FRAMES if frames is None else frames)
     return Stages(
@@ -115,8 +119,9 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
         if stage is not None:
             stage.check()
     unused = {"output", "real"} if options.real is None else {"output", "scene", "size"}
-    recorded = {name: str(value) if name == "real" else value for name, value in asdict(options).items()}
-    recorded = {name: value for name, value in recorded.items() if name not in unused and value is not None}
+    recorded = {name: value for name, value in asdict(options).items() if name not in unused and value is not None}
+    if options.real is not None:
+        recorded["real"] = str(options.real.resolve())
     record = output / RECORD
     if record.is_file() and read_json(record) != recorded:
         raise InputError(
@@ -124,7 +129,10 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
             "Choose another --output, or remove the folder."
         )
     finished, compared = output / RESULTS, stages.comparison.output
-    if record.is_file() and finished.is_file() and any(compared.glob(f"{RUNS}/*/*/{FIGURES}")):
+    shown = (finished, output / REPORT, output / PICTURE)
+    if record.is_file() and all(map(Path.is_file, shown)) and any(compared.glob(f"{RUNS}/*/*/{FIGURES}")):
+        # the recording may be another one by now
+        process(stages.processing, console)
         results = read_json(finished)
         show_tables(make_tables(read_comparison(compared)), console)
     else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -62,7 +62,9 @@ def inspect_scene(options: InspectOptions, console: Console | None = None) -> di
 
     measured, shown = measured_frames(scene, options.frames)
     chosen = [picture for picture in scene.pictures if picture.frame in set(measured)]
-    sheets = {picture.name: _sheet_name(picture) for picture in chosen if picture.frame in shown}
+    sheets = _sheet_names(picture for picture in chosen if picture.frame in shown)
+    # one that is interrupted leaves them to the next inspection
+    write_json(output / SUMMARY, {"sheets": list(sheets.values())})
     shown_scene = ShownScene(scene)
     sheet_of = {name: output / sheet for name, sheet in sheets.items()}
     jobs = [partial(_look_at, shown_scene, picture, sheet_of.get(picture.name), options) for picture in chosen]
@@ -124,13 +126,21 @@ def _open_output(output: Path) -> None:
     output.mkdir(parents=True, exist_ok=True)
     if (output / SUMMARY).is_file():
         earlier = read_json(output / SUMMARY)
-        for name in earlier.get("sheets", ()) if isinstance(earlier, dict) else ():
+        for name in [POSES, *(earlier.get("sheets", ()) if isinstance(earlier, dict) else ())]:
             if re.fullmatch(r"[\w.-]+\.png", str(name)):
                 (output / name).unlink(missing_ok=True)
 
 
-def _sheet_name(picture: ScenePicture) -> str:
-    return f"{re.sub(r'[^A-Za-z0-9_-]+', '_', picture.camera)}_{picture.frame:010d}.png"
+def _sheet_names(pictures: Iterable[ScenePicture]) -> dict[str, str]:
+    """Name each picture's sheet by its camera and frame, by the pictures' names."""
+    found: dict[str, str] = {}
+    for picture in pictures:
+        camera = re.sub(r"[^\w-]+", "_", picture.camera)
+        name = f"{camera}_{picture.frame:010d}.png"
+        while name in found.values():
+            name = f"_{name}"
+        found[picture.name] = name
+    return found
 
 
 def _look_at(shown: ShownScene, picture: ScenePicture, sheet: Path | None, options: InspectOptions) -> PictureFigures:

@@ -196,7 +196,8 @@ def map_figures(measured: Sequence[PictureFigures]) -> dict[str, Any]:
         return {"mean": _rounded(np.mean(known)), "min": _rounded(min(known)), "max": _rounded(max(known))}
 
     def pooled(name: str) -> NDArray[np.float32]:
-        return np.concatenate([getattr(figures, name) for figures in measured])
+        # a slow camera may have no picture among them
+        return np.concatenate([np.empty(0, np.float32), *(getattr(figures, name) for figures in measured)])
 
     def quantiles(values: NDArray[np.float32]) -> dict[str, Any] | None:
         if not len(values):

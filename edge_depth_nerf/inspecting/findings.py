@@ -85,10 +85,13 @@ def _checks(scene: SceneFolder) -> Iterator[Finding]:
 def _layers(scene: SceneFolder) -> Iterator[Finding]:
     has_lidar, has_mono = scene.has("lidar"), scene.has("mono")
     if not has_lidar and not has_mono:
+        prior = "there is no prior and training is plain nerfacto"
+        if scene.has("motion"):
+            prior = "the prior is made of distances from motion alone"
         yield Finding(
             "no_prior",
-            "The scene has neither LiDAR nor monocular maps, so there is no prior and training is plain nerfacto. "
-            "Process the drive with its sweeps, or with --mono.",
+            f"The scene has neither LiDAR nor monocular maps, so {prior}. Process the drive with its sweeps, or with "
+            "--mono.",
         )
     elif not has_lidar:
         yield Finding(

@@ -386,7 +386,9 @@ def _local(count: int) -> Iterator[Any]:
     places = places or [{} for _ in range(os.cpu_count() or 1)]
     security = Security.temporary()
     here = {"host": "127.0.0.1", "protocol": "tls://", "dashboard": False, "dashboard_address": "127.0.0.1:0"}
-    settings = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+    settings: dict[str, Any] = {f"distributed.{of}.http.routes": [] for of in ("scheduler", "worker")}
+    # a nanny would set OMP_NUM_THREADS=1 for this process, too
+    settings["distributed.nanny.pre-spawn-environ"] = {}
     with ExitStack() as stack:
         scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="edge-depth-nerf-"))
         stack.enter_context(dask.config.set(settings))

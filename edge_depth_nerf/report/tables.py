@@ -117,7 +117,7 @@ def page_of_tables(title: str, lines: Sequence[str], tables: Sequence[MadeTable]
     """Give a title, paragraphs and tables as Markdown."""
     parts = [f"# {title}", *lines]
     for table in tables:
-        headings = [f"{group} {heading}".strip() for group, heading in table.headings()]
+        headings = [f"{group} {heading}".strip().replace("|", r"\|") for group, heading in table.headings()]
         lines = [f"| | {' | '.join(headings)} |", "|---|" + "---|" * len(headings)]
         for row in table.rows:
             cells = [f"**{cell.text()}**" if cell.best else cell.text() for cell in row.cells]
@@ -129,6 +129,8 @@ def page_of_tables(title: str, lines: Sequence[str], tables: Sequence[MadeTable]
 _LATEX = {
     "\\": r"\textbackslash{}",
     **{char: f"\\{char}" for char in "&%$#_{}"},
+    "^": r"\^{}",
+    "~": r"\textasciitilde{}",
     "↑": r"$\uparrow$",
     "↓": r"$\downarrow$",
     "±": r"$\pm$",
