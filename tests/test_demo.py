@@ -202,12 +202,12 @@ def test_a_recording_is_checked_before_long_work(recording, tmp_path, monkeypatc
     ):
         with pytest.raises((InputError, FileNotFoundError), match=message):
             demo.run_demo(DemoOptions(real=root, frames=frames), QUIET)
-    for changes, message in (
-        ({"frames": -5}, "--frames -5: expected 1 or more"),
-        ({"size": 512}, "--size is of rendered"),
+    for options, message in (
+        (DemoOptions(real=recording, frames=-5), "--frames -5: expected 1 or more"),
+        (DemoOptions(real=recording, size=512), "--size is of rendered"),
     ):
         with pytest.raises(InputError, match=message):
-            demo.run_demo(replace(DemoOptions(real=recording), **changes), QUIET)
+            demo.run_demo(options, QUIET)
     assert not Path("outputs").exists()
 
 

@@ -16,6 +16,7 @@ from test_mono_hf import in_a_room, view_rays
 
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, write_png
+from edge_depth_nerf.cameras import KannalaBrandt, calibration_file
 from edge_depth_nerf.cameras.calibration_file import read_lens
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.entry import main
@@ -23,6 +24,7 @@ from edge_depth_nerf.mono.examples import scaled_lens
 from edge_depth_nerf.mono.fisheye import fisheye_depth
 from edge_depth_nerf.mono.options import FisheyeDepthOptions
 from edge_depth_nerf.mono.pinhole_views import pinhole_views
+from edge_depth_nerf.process.rig_file import RigCamera
 
 pytestmark = pytest.mark.slow
 
@@ -211,6 +213,40 @@ def test_a_rig_file_names_the_lens(tmp_path):
     assert read_lens(tmp_path / "rig.toml", "left") == dataclasses.replace(lens, theta_limit_rad=np.radians(95.0))
     with pytest.raises(InputError, match=r"no camera 'right'; it has left\. Name one: --camera left"):
         read_lens(tmp_path / "rig.toml", "right")
+
+
+@pytest.mark.parametrize(
+    ("given", "wrong", "said"),
+    [
+        ("k1 = 0.01", "kl = 0.01", "kl: unknown key; docs/rig.md"),
+        ("k1 = 0.01", "k5 = 0.01", "k5: unknown key; .* undistort the pictures"),
+        ("k1 = 0.01", "xi = 0.01", r"\.xi: unknown key; a camera of model kannala-brandt has k1, k2, k3, k4"),
+        ("cx = 63.5", "cx = 6350", r"\.cx is 6350\.0, expected a pixel within the picture, 0 to 128"),
+        ("width = 128", "width = 128.5", "expected whole numbers"),
+        ("k1", "pixel_centre = 7\nk1", r"\.pixel_centre is 7\.0, expected one of"),
+        ("k1", "theta_max_deg = -10\nk1", "theta_max_deg -10: expected more than 0"),
+    ],
+)
+def test_a_table_of_a_lens_is_checked_as_a_rig_file_is(tmp_path, given, wrong, said):
+    text = "model = 'kannala-brandt'\nwidth = 128\nheight = 128\nfx = 40\nfy = 40\ncx = 63.5\ncy = 63.5\nk1 = 0.01\n"
+    path = tmp_path / "lens.toml"
+    path.write_text(text)
+    assert read_lens(path) == KannalaBrandt(128, 128, 40.0, 40.0, 64.0, 64.0, 0.01, 0.0, 0.0, 0.0)
+    path.write_text(text.replace(given, wrong))
+    with pytest.raises(InputError, match=rf"lens\.toml.*{said}"):
+        read_lens(path)
+
+
+def test_keys_of_a_rig_file_are_known_where_its_lenses_are_read():
+    known = (*calibration_file.LENS, *calibration_file.LENS_NUMBERS, *calibration_file.LENS_PLACE)
+    assert sorted((*known, *calibration_file.BESIDE_LENS)) == sorted(RigCamera.model_fields)
+
+
+def test_a_lens_that_the_views_cannot_be_cut_with_is_refused(folder):
+    sheared = "3 -60 0 0.002\n1 0\n80 80\n1 0 0.2\n160 160\n"
+    (folder / "calib_results.txt").write_text(sheared)
+    with pytest.raises(InputError, match=r"calib_results.txt: camera lens: .* by 9.* px rms"):
+        fisheye_depth(FisheyeDepthOptions(folder / "pictures", folder / "calib_results.txt", folder / "out"))
 
 
 def test_the_command_with_a_ready_made_network(folder, monkeypatch, capsys):

@@ -293,6 +293,18 @@ def test_rays_of_spheres_are_those_of_the_papers(
     assert valid.all() and found.numpy() == pytest.approx(wanted, abs=1e-6)
 
 
+def test_coefficients_without_their_model_are_not_passed_over(mine: Path) -> None:
+    text = camchain("pinhole", "none", OPENCV, EQUIDISTANT)
+    (mine / "camchain.yaml").write_text(text.replace("  distortion_model: none\n", ""))
+    with pytest.raises(InputError, match=r"cam0\.distortion_coeffs is \[-0\.01.*expected 0 numbers"):
+        lens_of(mine, calibrated("camchain.yaml"))
+
+
+def test_a_lens_keeps_its_limit_in_a_rig_file(mine: Path) -> None:
+    (mine / "lens.toml").write_text(f"{LENS}theta_max_deg = 60\n")
+    assert lens_of(mine, calibrated("lens.toml")).theta_limit_rad == pytest.approx(np.radians(60))
+
+
 OPENCV, CENTRED = [6.5, 6.25, 8.0, 6.0], (6.5, 6.25, 8.5, 6.5)
 RADTAN, EQUIDISTANT = [-0.1, 0.01, 1e-3, 2e-3], [-0.01, 0.02, 0.0, 0.0]
 

@@ -501,14 +501,14 @@ def test_a_second_look_says_that_it_is_of_a_sample_and_leaves_no_sheets_of_the_f
 def test_a_slow_camera_is_in_no_sample_and_each_has_sheets_of_its_own(tmp_path, monkeypatch):
     drive = write_drive(tmp_path / "drive", 5)
 
-    def three_cameras(meta):
-        for frame, camera in ((1, "\u5f8c 2"), (2, "\u5f8c_2")):
-            meta["frames"][frame] |= {"camera": camera, "frame": 0}
+    def three_cameras(meta, numbers=(0, 0)):
+        for frame, camera, number in ((1, "\u5f8c 2", numbers[0]), (2, "\u5f8c_2", numbers[1])):
+            meta["frames"][frame] |= {"camera": camera, "frame": number}
 
     change(drive, three_cameras)
     sheets = look(drive, tmp_path / "out", frames=50)["sheets"]
     assert len({*sheets}) == len([*(tmp_path / "out").glob("*_0*.png")]) == 5
-    change(drive, lambda meta: [meta["frames"][n].update(frame=n) for n in (1, 2)])
+    change(drive, lambda meta: three_cameras(meta, (1, 2)))
     monkeypatch.setattr(figures, "MEASURED_PICTURES", 2)
     cameras = look(drive, tmp_path / "out", frames=1)["cameras"]
     assert [camera["prior_share"] is None for camera in cameras.values()] == [False, True, True]

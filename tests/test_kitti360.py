@@ -485,7 +485,9 @@ def test_frames_without_pose_sweep_or_picture_are_listed_and_skipped(tmp_path: P
 def test_first_frames_and_stride(tmp_path: Path) -> None:
     drive = write_room_drive(tmp_path / "drive", frames=7, beams=300, size=32, truth=True)
     for chosen, expected in (({"first": 1, "frames": 2, "stride": 4}, [1, 5]), ({"first": 3}, [3, 4, 5, 6])):
-        process(drive, tmp_path / str(len(expected)), **chosen)
+        report = process(drive, tmp_path / str(len(expected)), **chosen)
+        told = any("beside the path are left out: none is of a held-out frame" in said for said in report.notices)
+        assert told == (4 in expected)
         meta = read_json(tmp_path / str(len(expected)) / "transforms.json")
         assert [frame["frame"] for frame in meta["frames"]] == 2 * expected
         assert "shifted_views" not in meta, "those are of frame 4, which is not held out"

@@ -464,6 +464,8 @@ def test_views_beside_the_path_can_be_chosen_and_reach_the_scene(tmp_path, stree
     assert _manifest(drive)["options"]["shifts_m"] == [0.5, -1.0]
     with pytest.raises(InputError, match=r"--shifts-m 0\.125: expected metres, -99 to 99, with at most two decimals"):
         SynthesizeOptions(tmp_path, shifts_m=(0.125,)).check()
+    with pytest.raises(InputError, match=r"--shifts-m 3\.0 --layout rig: expected kitti-360, which alone"):
+        SynthesizeOptions(tmp_path, shifts_m=(3.0,), layout="rig").check()
 
 
 def test_what_moves_changes_place_and_nothing_else_is_masked(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 import yaml
 
 from edge_depth_nerf.base.bounds import finite, read_text, shown
-from edge_depth_nerf.base.errors import InputError, found_in
+from edge_depth_nerf.base.errors import InputError, found_in, require
 from edge_depth_nerf.base.files import read_json
 from edge_depth_nerf.cameras.models import MEI, Camera, KannalaBrandt, Pinhole
 from edge_depth_nerf.cameras.wide import EUCM, DoubleSphere, OCam
@@ -63,6 +64,15 @@ MODELS: dict[str, tuple[Any, tuple[str, ...]]] = {
 }
 """Models, and what they have beside focal lengths and principal point; `OF_MODEL` are needed, others 0 if left out."""
 OF_MODEL = ("xi", "alpha", "beta")
+LENS_NUMBERS = (*OF_MODEL, "k1", "k2", "k3", "k4", "p1", "p2")
+LENS = ("model", "width", "height", *_PINHOLE)
+"""What describes a lens in a rig file: these, `LENS_NUMBERS` as its model needs, and `LENS_PLACE`."""
+LENS_PLACE = ("pixel_centre", "theta_max_deg")
+BESIDE_LENS = (
+    *("calibration", "to_vehicle", "images", "ego_mask", "masks", "mono", "truth_distance", "truth_rgb", "depth"),
+    *("times_file", "times_from_names", "rate_hz", "time_unit", "time_offset_s"),
+)
+"""What else a rig file says of a camera."""
 _OCAM_COEFFICIENTS = range(1, 8)
 _OF_SCALE = (1e-2, 1e6)
 
@@ -172,7 +182,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def _table(path: Path, name: str) -> Camera:
-    """The keys of a lens in a rig file's table, or alone; all others are passed over."""
+    """The keys of a lens in a rig file's table, or alone."""
     try:
         content = parse_toml(read_text(path, _MAX_BYTES))
     except (ValueError, RecursionError) as error:
@@ -182,14 +192,47 @@ def _table(path: Path, name: str) -> Camera:
     where, lens = _chosen(path, found, name, "the keys of a lens, or tables [cameras.NAME]")
     if lens.get("model") not in [*MODELS]:
         raise InputError(f"{where}: model is {shown(lens.get('model'))}, expected one of {', '.join(MODELS)}.")
-    model, own = MODELS[lens["model"]]
-    keys = (*_PINHOLE, *own)
-    given = _numbers([lens.get(key, None if key in (*_PINHOLE, *OF_MODEL) else 0.0) for key in keys], keys, where)
-    more = _numbers([lens.get("pixel_centre", 0), lens.get("theta_max_deg", 180)], ("centre", "limit"), where)
-    for key in ("cx", "cy"):
-        given[key] -= more["centre"]
-    camera = _camera(model, given, [lens.get("width"), lens.get("height")], where)
-    return replace(camera, theta_limit_rad=math.radians(min(max(more["limit"], 1.0), 180.0)))
+    if unknown := [key for key in lens if key not in (*LENS, *LENS_NUMBERS, *LENS_PLACE, *BESIDE_LENS)]:
+        hint = f" {RATIONAL}." if unknown[0] in ("k5", "k6") else ""
+        raise InputError(f"{where}: {unknown[0]}: unknown key; docs/rig.md has those of a camera.{hint}")
+    keys = tuple(key for key in lens if key in (*LENS_NUMBERS, *LENS_PLACE) or key in LENS[1:])
+    keys += tuple(key for key in LENS[1:] if key not in lens)
+    given: dict[str, Any] = _numbers([lens.get(key) for key in keys], keys, where)
+    if any(given[side] % 1 for side in ("width", "height")):
+        raise InputError(f"{where}: width and height are {lens['width']} and {lens['height']}, expected whole numbers.")
+    sides = {side: int(given[side]) for side in ("width", "height")}
+    limit_deg = given.get("theta_max_deg", 180.0)
+    require(limit_deg > 0, f"{where}: theta_max_deg {limit_deg:g}", "more than 0")
+    with found_in(where):
+        camera = lens_of({**given, **sides, "model": lens["model"]})
+    return replace(camera, theta_limit_rad=min(math.radians(limit_deg), math.pi))
+
+
+def lens_of(given: Mapping[str, Any]) -> Camera:
+    """Make the lens that the keys of a rig file describe, pixel centres at +0.5.
+
+    Args:
+        given: all of `LENS`, and those of `LENS_NUMBERS` and "pixel_centre" that the file has.
+
+    Raises:
+        InputError: a value is out of its range, or the model has other keys.
+    """
+    for key, side in (("cx", "width"), ("cy", "height")):
+        if not 0 < given[key] < given[side]:
+            raise InputError(f".{key} is {given[key]}, expected a pixel within the picture, 0 to {given[side]}.")
+    centre = given.get("pixel_centre", 0)
+    if centre not in (0, 0.5, 1):
+        raise InputError(f".pixel_centre is {centre}, expected one of 0, 0.5, 1.")
+    model, own = MODELS[given["model"]]
+    if wrong := given.keys() & {*LENS_NUMBERS} - {*own}:
+        hint = f" {RATIONAL}." if "k4" in wrong and model is Pinhole else ""
+        raise InputError(f".{min(wrong)}: unknown key; a camera of model {given['model']} has {', '.join(own)}.{hint}")
+    if lacking := [key for key in own if key in OF_MODEL and key not in given]:
+        raise InputError(f".{lacking[0]} is missing; expected a number.")
+    middle = {key: given[key] + 0.5 - centre for key in ("cx", "cy")}
+    kept = {key: given[key] for key in ("width", "height", "fx", "fy")}
+    with found_in(".model"):
+        return model(**kept, **middle, **{key: given.get(key, 0.0) for key in own})
 
 
 def _chosen(path: Path, cameras: dict[str, dict[str, Any]], name: str, kind: str) -> tuple[str, dict[str, Any]]:
@@ -210,7 +253,8 @@ def _chosen(path: Path, cameras: dict[str, dict[str, Any]], name: str, kind: str
 def _numbers(values: Any, names: tuple[str, ...], where: str) -> dict[str, float]:
     found = [finite(value) for value in values] if isinstance(values, list) else []
     given = {name: value for name, value in zip(names, found, strict=False) if value is not None}
-    if len(given) != len(names) or (names and len(found) != len(names)):
+    # zeros say that there is no distortion
+    if len(given) != len(names) or (len(found) != len(names) and (names or any(found))):
         raise InputError(f"{where} is {shown(values)}, expected {len(names)} numbers: {', '.join(names)}.")
     return given
 

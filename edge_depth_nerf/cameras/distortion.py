@@ -1,6 +1,6 @@
 """Radial and tangential lens distortion of a plane, and its inverse.
 
-All three camera models bend a plane of undistorted coordinates x (2-vectors, no unit; what they mean is the
+Camera models with distortion bend a plane of undistorted coordinates x (2-vectors, no unit; what they mean is the
 camera's business) by the same map
 
     F(x) = d(r²)·x + r²·p + 2(p·x)·x,    r = |x|,  d = 1 + Σ k_i r^(2i),  p = (p2, p1)

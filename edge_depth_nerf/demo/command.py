@@ -119,9 +119,8 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
         if stage is not None:
             stage.check()
     unused = {"output", "real"} if options.real is None else {"output", "scene", "size"}
-    recorded = {name: value for name, value in asdict(options).items() if name not in unused and value is not None}
-    if options.real is not None:
-        recorded["real"] = str(options.real.resolve())
+    given = {**asdict(options), "real": options.real and str(options.real.resolve())}
+    recorded = {name: value for name, value in given.items() if name not in unused and value is not None}
     record = output / RECORD
     if record.is_file() and read_json(record) != recorded:
         raise InputError(

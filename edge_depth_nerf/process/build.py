@@ -132,6 +132,9 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         )
         for picture in recording.pictures
     ]
+    shifted = [view for view in recording.shifted if view.frame in held_out]
+    if recording.shifted and not shifted:
+        notices.append("The drive's true views beside the path are left out: none is of a held-out frame.")
     scanners = keep_sweeps(recording, options, held_out, world_offset_m(frames), console)
     report = write_scene(
         options.output,
@@ -140,7 +143,7 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         layers=builder.layers,
         source=source,
         theta_max_deg=options.theta_max_deg,
-        shifted=[view for view in recording.shifted if view.frame in held_out],
+        shifted=shifted,
         scanners=scanners,
         strict=options.strict,
         console=console,

@@ -35,7 +35,7 @@ from pydantic.fields import FieldInfo
 from edge_depth_nerf.base.bounds import MAX_TIME_S, path_inside, read_text, shown
 from edge_depth_nerf.base.errors import InputError, found_in
 from edge_depth_nerf.cameras import Camera
-from edge_depth_nerf.cameras.calibration_file import MODELS, OF_MODEL, RATIONAL, parse_toml, read_lens
+from edge_depth_nerf.cameras.calibration_file import LENS, LENS_NUMBERS, RATIONAL, lens_of, parse_toml, read_lens
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar.scans import PointTimes, ScanFormat
 from edge_depth_nerf.lidar.sweeps import SweepTiming
@@ -53,9 +53,6 @@ _TODO_LINE = re.compile(rf"""\s*([\w.-]+)\s*=\s*["']{TODO}:?\s*(.*?)["']\s*(#.*)
 _TABLE_LINE = re.compile(r"\s*\[([^\[\]]+)\]\s*(#.*)?")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
-_LENS = ("model", "width", "height", "fx", "fy", "cx", "cy")
-"""What describes a lens, unless a calibration file does."""
-_LENS_NUMBERS = ("xi", "alpha", "beta", "k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def _inside(value: object, info: Any) -> Path:
@@ -219,7 +216,7 @@ class RigCamera(_Sensor):
     """A camera of the rig."""
 
     calibration: CalibrationFile | None = None
-    """Takes the place of `_LENS` and `_LENS_NUMBERS`."""
+    """Takes the place of `LENS` and `LENS_NUMBERS`."""
     model: (
         Literal["mei", "kannala-brandt", "opencv_fisheye", "equidistant", "pinhole", "double-sphere", "ds", "eucm"]
         | None
@@ -261,46 +258,25 @@ class RigCamera(_Sensor):
 
     @classmethod
     def _needed(cls, values: dict[str, Any]) -> set[str]:
-        return super()._needed(values) | ({*_LENS} if values.get("calibration") is None else set())
+        return super()._needed(values) | ({*LENS} if values.get("calibration") is None else set())
 
     @cached_property
     def camera(self) -> Camera:
         """Its model, pixel centres at +0.5."""
-        camera = self._calibrated() if self.calibration else self._of_numbers()
-        limit_rad = min(math.radians(self.theta_max_deg), math.pi)
+        if self.calibration:
+            camera = self._calibrated()
+        else:
+            keys = self.model_fields_set & {*LENS, *LENS_NUMBERS, "pixel_centre"}
+            camera = lens_of({key: getattr(self, key) for key in keys})
+        limit_rad = min(math.radians(self.theta_max_deg), camera.theta_limit_rad)
         return replace(camera, theta_limit_rad=limit_rad)
 
     def _calibrated(self) -> Camera:
         assert self.calibration is not None
-        if twice := self.model_fields_set & {*_LENS, *_LENS_NUMBERS, "pixel_centre"}:
+        if twice := self.model_fields_set & {*LENS, *LENS_NUMBERS, "pixel_centre"}:
             raise InputError(f".{min(twice)}: the calibration file describes the lens; remove one of them.")
         with found_in(".calibration"):
             return read_lens(self.calibration.file, self.calibration.camera)
-
-    def _of_numbers(self) -> Camera:
-        assert self.model and self.width and self.height and self.cx is not None and self.cy is not None
-        for key, value, size in (("cx", self.cx, self.width), ("cy", self.cy, self.height)):
-            if not 0 < value < size:
-                raise InputError(f".{key} is {value}, expected a pixel within the picture, 0 to {size}.")
-        if self.pixel_centre not in (0, 0.5, 1):
-            raise InputError(f".pixel_centre is {self.pixel_centre}, expected one of 0, 0.5, 1.")
-        kind, own = MODELS[self.model]
-        if wrong := self.model_fields_set & {*_LENS_NUMBERS} - {*own}:
-            hint = f" {RATIONAL}." if "k4" in wrong and self.model == "pinhole" else ""
-            raise InputError(f".{min(wrong)}: unknown key; a camera of model {self.model} has {', '.join(own)}.{hint}")
-        if lacking := [key for key in own if key in OF_MODEL and getattr(self, key) is None]:
-            raise InputError(f".{lacking[0]} is missing; expected a number.")
-        shift = 0.5 - self.pixel_centre
-        with found_in(".model"):
-            return kind(
-                width=self.width,
-                height=self.height,
-                fx=self.fx,
-                fy=self.fy,
-                cx=self.cx + shift,
-                cy=self.cy + shift,
-                **{key: getattr(self, key) for key in own},
-            )
 
     @model_validator(mode="after")
     def _check(self) -> RigCamera:

@@ -36,9 +36,9 @@ class SynthesizeOptions:
     scene: SceneName = "street"
     """A street, an underground car park, a junction, a street with moving cars and people, or a roundabout."""
     frames: int = 40
-    """Number of frames, 0.1 s apart, each with two pictures and one LiDAR sweep."""
+    """Number of frames, 0.1 s apart, each with a picture of every camera and one LiDAR sweep."""
     size: int = 350
-    """Width and height of the pictures in pixels; KITTI-360's own are 1400."""
+    """Width of the pictures in pixels, and height of fisheyes; KITTI-360's own are 1400."""
     seed: int = 0
     """Seed of everything random. Same options, same bytes."""
     shifts_m: tuple[float, ...] = (1.0, 2.0)
@@ -68,4 +68,6 @@ class SynthesizeOptions:
         require(self.seed >= 0, f"--seed {self.seed}", "0 or more")
         fine = all(abs(shift_m) <= 99 and round(shift_m, 2) == shift_m for shift_m in self.shifts_m)
         given = " ".join(map(str, self.shifts_m))
+        has_views = self.layout == "kitti-360" or self.shifts_m == type(self).shifts_m
+        require(has_views, f"--shifts-m {given} --layout {self.layout}", "kitti-360, which alone has such views")
         require(fine, f"--shifts-m {given}", "metres, -99 to 99, with at most two decimals")
