@@ -14,14 +14,24 @@ from edge_depth_nerf.method.error_model import (
     FIELD_MARGIN_DEG,
     KNOTS,
     LEAST_EVALUATED,
+    MOTION_KNOTS,
     error_of_lidar_points,
     fit_error_model,
+    motion_features,
     pixel_features,
     read_calibration,
 )
 from edge_depth_nerf.method.prior import PriorOptions, RayAngles, make_prior
 from edge_depth_nerf.mono import calibration as calibration_module
-from edge_depth_nerf.mono.calibration import calibrate_scene, find_calibration, held_out_points, measure_frame
+from edge_depth_nerf.mono.calibration import (
+    calibrate_scene,
+    combine,
+    find_calibration,
+    fit_of_drive,
+    held_out_points,
+    measure_frame,
+    points_of_both,
+)
 from edge_depth_nerf.scene.format import CALIBRATION_FILE
 from edge_depth_nerf.scene.put_maps import write_maps
 from edge_depth_nerf.scene.reader import read_scene
@@ -119,7 +129,7 @@ def test_what_other_frames_show_above_the_points_is_evaluated():
     mono = np.where(elevation_deg <= 2, truth, 4 / 3 * truth).astype(np.float32)
     far_seen = np.where(elevation_deg > 2, truth, 0).astype(np.float32)
     alone = measure_frame("a", 0, lidar, mono, usable, view, PriorOptions())
-    more = measure_frame("a", 0, lidar, mono, usable, view, PriorOptions(), far_seen)
+    more = measure_frame("a", 0, lidar, mono, usable, view, PriorOptions(), far_seen_m=far_seen)
     assert alone.errors.relative.max() < 0.05
     new = len(more.errors.relative) - len(alone.errors.relative)
     assert new == np.count_nonzero((elevation_deg > 2) & (elevation_deg <= 2 + FIELD_MARGIN_DEG - 0.3))
@@ -143,6 +153,56 @@ def test_features_of_pixels():
     assert found["step"][1, 10] == 0  # beside pixels without a map
     assert found["spread"][10, 10] == pytest.approx(0.05)
     assert found["theta_deg"][3, 3] == pytest.approx(45)
+
+
+def test_features_of_distances_from_motion():
+    motion = np.full((20, 30), 10, np.float32)
+    motion[:, 20:] = 12
+    motion[10, 5] = 0
+    none = np.zeros_like(motion)
+    found = motion_features(dict.fromkeys(("distance_m", "spread", "step"), none), motion, 0.05 * motion, none + 0.5)
+    assert set(found) == {*MOTION_KNOTS, "distance_m"}
+    # the pixels beside a jump, and those around one without a distance, count as rims; the picture's border does not
+    assert [found["rim_px"][0, column] for column in (19, 20, 17)] == [0, 0, pytest.approx(2, abs=0.1)]
+    assert found["rim_px"][10, 6] == found["rim_px"][9, 5] == 0 and found["rim_px"][10, 8] > 1.9
+    assert found["rim_px"][0, 12] > 5
+    assert found["by_matching"][3, 3] == pytest.approx(0.05)
+    assert found["elevation_deg"][3, 3] == pytest.approx(28.648, abs=1e-3)
+
+
+def few_points(points: int, number: int):
+    """A frame whose monocular map is half of the truth, right to 1 %, and so many LiDAR points."""
+    rng = np.random.default_rng([points, number])
+    shape = (120, 160)
+    truth = np.broadcast_to(20 * np.exp(0.3 * np.sin(np.arange(160) / 25 + number)), shape).astype(np.float32)
+    mono = (truth / 2 * np.exp(rng.normal(0, 0.01, shape))).astype(np.float32)
+    lidar = np.zeros(shape, np.float32)
+    chosen = rng.choice(truth.size, points, replace=False)
+    lidar.flat[chosen] = truth.flat[chosen]
+    return truth, lidar, mono
+
+
+def test_errors_of_frames_with_few_points_are_those_of_their_prior():
+    """They take the drive's fit there; measured without it, sigma was half of the distance."""
+    shape, options = (120, 160), PriorOptions()
+    elevation = np.broadcast_to(np.linspace(0.3, -0.3, shape[0], dtype=np.float32)[:, None], shape)
+    view, usable = RayAngles(np.zeros(shape, np.float32), elevation), np.ones(shape, bool)
+    data = [few_points(45, number) for number in range(60)]
+    drive_fit = fit_of_drive(
+        [points_of_both(n, lidar, mono, usable) for n, (_, lidar, mono) in enumerate(data)], options
+    )
+    frames = [
+        measure_frame(str(n), n, lidar, mono, usable, view, options, drive_fit)
+        for n, (_, lidar, mono) in enumerate(data)
+    ]
+    calibration = combine(frames, "", everywhere=False, drive_fit=drive_fit)
+    assert {frame.fit_of for frame in calibration.frames} == {"drive"}
+    truth, lidar, mono = few_points(45, 60)
+    prior = make_prior(both(lidar, mono), usable, "integrated", options, calibration, view)
+    elsewhere = (prior.distance_m > 0) & (lidar == 0)
+    off = np.abs(prior.distance_m - truth)[elsewhere]
+    assert 0.9 < np.mean(off < 2 * prior.sigma_m[elsewhere]) <= 1
+    assert np.median(prior.sigma_m[elsewhere] / truth[elsewhere]) < 0.02
 
 
 def test_blocks_rows_and_single_points_are_left_out():

@@ -42,6 +42,11 @@ def level(prior: list[float], scale: float = 1.0, **more) -> Level:
     return Level(weights, edges[:, :-1], edges[:, 1:], torch.tensor(prior), torch.ones(len(prior)), **more)
 
 
+@dataclass(frozen=True)
+class WithoutDefault(DepthLoss):
+    option: float
+
+
 @pytest.fixture
 def table(monkeypatch):
     monkeypatch.setattr(depth_losses, "LOSSES", dict(LOSSES))
@@ -67,6 +72,11 @@ def test_the_table_has_ours_and_what_is_registered(table, monkeypatch):
         ("off=test_depth_losses:level", "TypeError"),
         ("off=test_depth_losses:EntryPoint", "not derived from DepthLoss"),
         ("off", "off= is left out"),
+        ("2nd=test_depth_losses:OffLoss", "cannot be that of an option"),
+        ("lambda=test_depth_losses:OffLoss", "cannot be that of an option"),
+        ("none=test_depth_losses:OffLoss", "another loss of this name"),
+        ("urban_nerf=test_depth_losses:OffLoss", "another loss of this name"),
+        ("off=test_depth_losses:WithoutDefault", "missing 1 required"),
     ],
 )
 def test_what_is_no_loss_is_left_out_with_a_warning(table, named, words):

@@ -152,7 +152,7 @@ def beyond_frames(mono_error: float, count: int = 12, seed: int = 0):
         motion = MotionMap(moved, 0.8, usable, beyond, around)
         sigma_m = 0.03 * moved
         measured = measure_frame(*(str(number), number, lidar, mono, usable, view, PriorOptions()), motion=motion)
-        extra = measure_beyond(number, lidar, mono, usable, view, PriorOptions(), motion, sigma_m, blocks)
+        extra = measure_beyond(number, lidar, mono, usable, view, PriorOptions(), None, motion, sigma_m, blocks)
         frames.append(dataclasses.replace(measured, beyond=extra))
         # of a frame as it is used: no motion in other blocks, as where nothing matches
         holes = np.kron(rng.random((8, 12)) < 0.25, np.ones((10, 10))) > 0
@@ -165,7 +165,7 @@ def beyond_frames(mono_error: float, count: int = 12, seed: int = 0):
 def three_percent():
     """Frames whose network is wrong by 3 % beyond the field, and what they give."""
     frames, maps, view, where = beyond_frames(0.03)
-    return combine(frames, PriorOptions(), "key", False, motion_errors=(0.01, 0.02)), maps, view, where
+    return combine(frames, "key", False, motion_errors=(0.01, 0.02)), maps, view, where
 
 
 def covered(calibration, maps, view, where) -> tuple[float, float]:
@@ -184,7 +184,7 @@ def covered(calibration, maps, view, where) -> tuple[float, float]:
 
 def test_sigma_of_the_network_beyond_the_field_is_its_own():
     frames, _, _, _ = beyond_frames(0.06)
-    calibration = combine(frames, PriorOptions(), "key", False, motion_errors=(0.01, 0.02))
+    calibration = combine(frames, "key", False, motion_errors=(0.01, 0.02))
     _, maps, view, beyond = beyond_frames(0.06, count=6, seed=1)
     one, two = covered(calibration, maps, view, beyond)
     assert one == pytest.approx(0.68, abs=0.12) and two == pytest.approx(0.95, abs=0.05)
@@ -283,7 +283,7 @@ def test_sigma_above_the_field_is_not_that_of_the_road():
 
 def test_sigma_of_motion_beyond_the_field_is_that_measured_in_it():
     frames, maps, view, beyond = beyond_frames(0.15)
-    calibration = combine(frames, PriorOptions(), "key", False, motion_errors=(0.01, 0.02))
+    calibration = combine(frames, "key", False, motion_errors=(0.01, 0.02))
     scaled = []
     for truth, of_source in maps:
         prior = make_prior(of_source, np.ones(SIZE, bool), "integrated", PriorOptions(), calibration, view)

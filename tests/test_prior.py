@@ -9,9 +9,25 @@ from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.cameras import KannalaBrandt
 from edge_depth_nerf.method import prior as prior_module
 from edge_depth_nerf.method.alignment import Fit
-from edge_depth_nerf.method.error_model import KNOTS, Calibration, ErrorModel, MotionCalibration
+from edge_depth_nerf.method.error_model import (
+    KNOTS,
+    MOTION_KNOTS,
+    BeyondField,
+    Calibration,
+    ErrorModel,
+    MotionCalibration,
+)
 from edge_depth_nerf.method.integration import IntegrationOptions, integrate_depth
-from edge_depth_nerf.method.prior import PriorCache, PriorOptions, RayAngles, make_prior, ray_angles, sky_of
+from edge_depth_nerf.method.prior import (
+    MotionMap,
+    PriorCache,
+    PriorOptions,
+    RayAngles,
+    integrate_frame,
+    make_prior,
+    ray_angles,
+    sky_of,
+)
 
 
 def both(lidar: np.ndarray, mono: np.ndarray) -> dict[str, np.ndarray]:
@@ -242,6 +258,36 @@ def test_above_lidars_field_there_is_a_prior_where_motion_gives_one():
     np.testing.assert_allclose(prior.sigma_m[lidar_points], 0.01 * lidar[lidar_points], rtol=1e-5)
     mono_alone = mask & in_field & ~lidar_points & (motion == 0)
     np.testing.assert_allclose(prior.sigma_m[mono_alone], 0.1 * prior.distance_m[mono_alone], rtol=1e-5)
+
+
+def test_a_lidar_point_keeps_its_distance_and_its_error_beside_motion():
+    """Where the monocular map says nothing, or "far"; and above LiDAR's field."""
+    _, mono, mask = maps(60, 50)
+    view, in_field = field_view(mask.shape)
+    mask[:], mono[40, 20], mono[40, 30] = True, 0, 220
+    lidar, motion = np.zeros_like(mono), np.full_like(mono, 7)
+    points = [40, 40, 5], [20, 30, 25]
+    lidar[points] = 12
+    flat, of_network = ({name: [0.0] * len(at) for name, at in knots.items()} for knots in (MOTION_KNOTS, KNOTS))
+    models = ErrorModel(float(np.log(0.07)), flat), ErrorModel(float(np.log(0.2)), of_network)
+    beyond = BeyondField(*models, (-1.0, 1.0), 5.0)
+    of_motion = dataclasses.replace(motion_calibration(), beyond=beyond)
+    calibration = a_calibration(field_rad=(-1.0, 0.0), motion=of_motion)
+    prior = make_prior({**both(lidar, mono), "motion": motion}, mask, "integrated", PriorOptions(), calibration, view)
+    assert not in_field[5, 25] and in_field[40, 20]
+    np.testing.assert_allclose(prior.distance_m[points], 12)
+    np.testing.assert_allclose(prior.sigma_m[points], 0.12, rtol=1e-5)
+    assert prior.sigma_m[5, 20] == pytest.approx(0.07 * 7, rel=1e-5)
+
+
+def test_where_motion_counts_alone_the_monocular_map_has_no_part():
+    lidar, mono, mask = maps(60, 50)
+    mask[:] = True
+    _, in_field = field_view(mask.shape)
+    motion = MotionMap(np.full_like(mono, 7), 0.5, mask, ~in_field)
+    frame = integrate_frame(np.where(in_field, lidar, 0), mono, mask, "integrated", PriorOptions(), motion=motion)
+    np.testing.assert_array_equal(frame.mono_m[~in_field], np.float32(7))
+    assert not (frame.mono_m[in_field] == 7).any()
 
 
 def test_motion_moves_the_prior_by_its_weight():

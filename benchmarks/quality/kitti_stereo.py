@@ -35,7 +35,7 @@ from edge_depth_nerf.lidar.world import sweep_in_world
 from edge_depth_nerf.method.alignment import align
 from edge_depth_nerf.method.integration import IntegrationOptions
 from edge_depth_nerf.method.prior import PriorOptions, make_prior, ray_angles
-from edge_depth_nerf.mono.calibration import combine, measure_frame
+from edge_depth_nerf.mono.calibration import combine, fit_of_drive, measure_frame, points_of_both
 
 KEPT = Path(__file__).with_suffix(".json")
 """The figures of the page."""
@@ -124,11 +124,12 @@ def figures(found: np.ndarray, sigma: np.ndarray | None, truth: np.ndarray, nois
 def evaluate(folder: Path, names: list[str], one_of: int) -> dict[str, dict[str, list[dict[str, float]]]]:
     """Figures of each frame by region and method."""
     data = [read(folder, name, one_of) for name in track(names, "Projecting sweeps")]
+    drive_fit = fit_of_drive([points_of_both(i, *maps[:2], EVERYWHERE) for i, maps in enumerate(data)], OURS)
     measured = [
-        measure_frame(name, i, *maps[:2], EVERYWHERE, VIEW, OURS)
+        measure_frame(name, i, *maps[:2], EVERYWHERE, VIEW, OURS, drive_fit)
         for i, (name, maps) in enumerate(zip(names, data, strict=True))
     ]
-    calibration = combine(measured, OURS, "", everywhere=False)
+    calibration = combine(measured, "", everywhere=False, drive_fit=drive_fit)
     rough = [np.stack([scatter(maps[2]), maps[2]])[:, (maps[2] > 0) & ~maps[3]] for maps in data]
     off, at = np.concatenate(rough, 1)
     # the median of a normal distribution's absolute values is 0.6745 of its standard deviation

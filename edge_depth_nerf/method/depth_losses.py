@@ -7,6 +7,7 @@ docs/extending.md.
 
 from __future__ import annotations
 
+import keyword
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -173,6 +174,13 @@ def register(named: str) -> None:
             found = entry.load()
             if not issubclass(found, DepthLoss):
                 raise TypeError("it is not derived from DepthLoss")
+            option = entry.name.replace("-", "_")
+            if not option.isidentifier() or keyword.iskeyword(option):
+                raise ValueError("its name cannot be that of an option")
+            others = {name.replace("-", "_") for name, kind in LOSSES.items() if (name, kind) != (entry.name, found)}
+            if option in {"none", *others}:
+                raise ValueError("there is another loss of this name")
+            found()  # every option needs a default
         except Exception as error:  # whatever somebody's module raises
             warnings.warn(
                 f"{entry.group}: the loss {entry.name}={entry.value} is left out ({type(error).__name__}: {error}); "

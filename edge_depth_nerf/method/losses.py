@@ -159,6 +159,7 @@ def urban_nerf_loss_of_nerfstudio(
     """
     given = {"starts_m": starts_m, "ends_m": ends_m, "prior_m": prior_m, "expected_m": expected_m}
     _check_shapes("urban_nerf_loss_of_nerfstudio", weights, **given)
+    weights, starts_m, ends_m, prior_m, expected_m = _exact(weights, starts_m, ends_m, prior_m, expected_m)
     deviation_m = _positive("urban_nerf_loss_of_nerfstudio", sigma_m) / REACH_OF_NERFSTUDIO
     has_prior = (prior_m > 0) & torch.isfinite(prior_m)
     prior = torch.where(has_prior, prior_m, 1)

@@ -27,7 +27,7 @@ from edge_depth_nerf.base.files import load_archive
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.masks.sky import regions_like_sky
-from edge_depth_nerf.method.alignment import Align, align
+from edge_depth_nerf.method.alignment import Align, Fit, align
 from edge_depth_nerf.method.error_model import Calibration, motion_features, pixel_features
 from edge_depth_nerf.method.integration import (
     INTEGRATED,
@@ -42,7 +42,7 @@ from edge_depth_nerf.method.integration import (
     weight_of_errors,
 )
 
-CACHE_VERSION = 7
+CACHE_VERSION = 8
 """Part of every key: raised whenever the same inputs give another prior."""
 
 KEPT_SETS = 4
@@ -201,7 +201,7 @@ def integrate_frame(
     mask: NDArray[np.bool_],
     depth_source: str,
     options: PriorOptions,
-    calibration: Calibration | None = None,
+    drive_fit: Fit | None = None,
     motion: MotionMap | None = None,
     device: torch.device | str = "cpu",
 ) -> IntegratedFrame:
@@ -213,7 +213,7 @@ def integrate_frame(
         mask: H×W, True where the picture may be used.
         depth_source: integrated, or mono alone.
         options: what is made of them.
-        calibration: the drive's calibration, for its fit.
+        drive_fit: that of `Calibration`, for a frame with few LiDAR points.
         motion: what is known from motion; for the integrated source.
         device: what integrates.
 
@@ -221,17 +221,16 @@ def integrate_frame(
         InputError: the maps differ in size.
     """
     anywhere, mask = mask, mask & ~(mono_m > FARTHEST_M)
-    lidar_points = mask & np.isfinite(lidar_m) & (lidar_m > 0)
+    # where the monocular map means "far" a LiDAR point counts with motion, as where it says nothing
+    lidar_points = (mask if motion is None else anywhere) & np.isfinite(lidar_m) & (lidar_m > 0)
     if depth_source == "mono":
         lidar_points = np.zeros_like(mask)
     else:
         fitted_to_m = lidar_m if motion is None else _measured(lidar_m, motion)
-        mono_m = align(fitted_to_m, mono_m, mask, options.align, calibration.drive_fit if calibration else None).mono_m
+        mono_m = align(fitted_to_m, mono_m, mask, options.align, drive_fit).mono_m
     from_motion = np.zeros_like(mask)
     if motion is not None:
         from_motion = anywhere & (motion.distance_m > 0) & ~lidar_points
-        # where the monocular map means "far" a LiDAR point takes no part, with motion or without
-        lidar_m = np.where(mask, lidar_m, np.float32(0))
         mono_counts = mask & motion.mono_counts & ~(motion.alone & (motion.distance_m > 0))
         if motion.around_m is not None:
             mono_counts &= ~motion.alone | confirmed(mono_m, motion.around_m)
@@ -383,7 +382,7 @@ def make_prior(
             mask = mask if calibration.everywhere else mask & calibration.in_field(view.elevation_rad)
         if calibration.error_model is not None and (lidar_m is not None or depth_source == "mono"):
             lidar_m = np.zeros_like(mono_m) if lidar_m is None else lidar_m
-            frame = integrate_frame(lidar_m, mono_m, mask, depth_source, options, calibration, motion, device)
+            frame = integrate_frame(lidar_m, mono_m, mask, depth_source, options, calibration.drive_fit, motion, device)
             sigma = sigma_of(frame, calibration, view, motion, motion_sigma_m)
             return Prior(frame.distance_m, np.where(frame.distance_m > 0, sigma, np.float32(0)))
         # what could not be measured takes no part

@@ -36,7 +36,7 @@ from edge_depth_nerf.base.console import progress_bars
 from edge_depth_nerf.base.errors import InputError
 from edge_depth_nerf.base.files import sha256_of
 from edge_depth_nerf.base.numbers import spread_over
-from edge_depth_nerf.method.alignment import LEAST_POINTS, align, both, fit_logs
+from edge_depth_nerf.method.alignment import LEAST_POINTS, Fit, align, both, fit_logs
 from edge_depth_nerf.method.error_model import (
     FIELD_MARGIN_DEG,
     LEAST_EVALUATED,
@@ -152,10 +152,6 @@ class MeasuredFrame:
     """Of the LiDAR points of pixels that keep theirs, against their neighbours."""
     elevation_rad: NDArray[np.float32]
     """Of all LiDAR points, above the horizon."""
-    lidar_m: NDArray[np.float32]
-    """Of pixels with LiDAR and mono."""
-    mono_m: NDArray[np.float32]
-    """The map as it came, at the same pixels."""
     from_motion: NDArray[np.bool_]
     """Whether motion has a part in each of the pixels of `errors`."""
     beyond: MeasuredBeyond | None = None
@@ -344,23 +340,18 @@ def _calibrate(
             beyond = ~_within(field_rad, view)
             motion = MotionMap(motion_m, weight_of_errors(*errors), np.ones_like(maps.usable), beyond, around_m)
         far_seen_m = seen_above(cloud, scene, picture, (picture.lens.width, picture.lens.height))
-        measured = measure_frame(
-            *(picture.name, number, maps.lidar_m, maps.mono_m, maps.usable, view, options, far_seen_m, depth_source),
-            motion=motion,
-            device=device,
-        )
+        given = number, maps.lidar_m, maps.mono_m, maps.usable, view, options, drive_fit
+        measured = measure_frame(picture.name, *given, far_seen_m, depth_source, motion=motion, device=device)
         if motion is None:
             return measured
         left_out = left_out_pixels(scene, picture, motion.distance_m)
         sigma_m = motion_sigma(motion.distance_m, maps.distances_m.get("motion_sigma"))
-        measured_beyond = measure_beyond(
-            *(number, maps.lidar_m, maps.mono_m, maps.usable, view, options), motion, sigma_m, left_out, device
-        )
+        measured_beyond = measure_beyond(*given, motion, sigma_m, left_out, device)
         return dataclasses.replace(measured, beyond=measured_beyond)
 
     bars = progress_bars(console or Console(quiet=True), transient=True)
     with bars as progress, ThreadPoolExecutor(2) as pool:
-        task = progress.add_task("Measuring the prior's error…", total=(4 + with_motion) * len(measurable))
+        task = progress.add_task("Measuring the prior's error…", total=(5 + with_motion) * len(measurable))
 
         def counted(work: Callable[[tuple[int, ScenePicture]], Any]) -> Iterator[Any]:
             for found in pool.map(work, enumerate(measurable)):
@@ -368,12 +359,40 @@ def _calibrate(
                 yield found
 
         cloud = static_cloud(scene, measurable, lambda: progress.advance(task))
+        drive_fit = fit_of_drive([*counted(partial(_points_of_drive, scene))], options, depth_source)
         if with_motion:
-            of_both, elevations_rad = zip(*counted(partial(_errors_of_both, scene, options)), strict=True)
+            of_both, elevations_rad = zip(*counted(partial(_errors_of_both, scene, options, drive_fit)), strict=True)
             errors, field_rad = _motion_errors(of_both), _field_rad(elevations_rad)
         frames = list(counted(measure))
     made_of = _made_of(scene, pictures, depth_source, options)
-    return combine(frames, options, made_of, maps_trained_on(scene.meta) == "elsewhere", depth_source, errors)
+    return combine(frames, made_of, maps_trained_on(scene.meta) == "elsewhere", drive_fit, errors)
+
+
+def _points_of_drive(scene: SceneFolder, numbered: tuple[int, ScenePicture]) -> NDArray[np.float32]:
+    number, picture = numbered
+    maps = scene.maps(picture)
+    assert maps.lidar_m is not None and maps.mono_m is not None
+    return points_of_both(number, maps.lidar_m, maps.mono_m, maps.usable)
+
+
+def points_of_both(
+    number: int, lidar_m: NDArray[np.float32], mono_m: NDArray[np.float32], usable: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """2×N: a frame's LiDAR and monocular distances where it has both, for the drive's fit."""
+    some = _some(both(lidar_m, mono_m, usable), _FOR_THE_DRIVE_A_FRAME, np.random.default_rng([11, number]))
+    return np.stack([lidar_m[some], mono_m[some]])
+
+
+def fit_of_drive(
+    of_frames: Sequence[NDArray[np.float32]], options: PriorOptions, depth_source: str = INTEGRATED
+) -> Fit | None:
+    """Fit monocular maps to LiDAR by the points of all frames, as `points_of_both` gives them.
+
+    None of too few, and where maps are not aligned.
+    """
+    found = np.concatenate(of_frames, 1)
+    aligned = options.align != "none" and depth_source == INTEGRATED
+    return fit_logs(*found) if aligned and found.shape[1] >= LEAST_POINTS else None
 
 
 def _within(field_rad: tuple[float, float], view: RayAngles) -> NDArray[np.bool_]:
@@ -389,7 +408,7 @@ def _field_rad(elevations_rad: Sequence[NDArray[np.float32]]) -> tuple[float, fl
 
 
 def _errors_of_both(
-    scene: SceneFolder, options: PriorOptions, numbered: tuple[int, ScenePicture]
+    scene: SceneFolder, options: PriorOptions, drive_fit: Fit | None, numbered: tuple[int, ScenePicture]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """2×N: relative errors of motion and of the monocular map, at LiDAR points held out of the latter's alignment.
 
@@ -402,7 +421,8 @@ def _errors_of_both(
         return np.empty((2, 0), np.float32), np.empty(0, np.float32)
     elevation_rad = ray_angles(picture.lens, picture.up_in_camera).elevation_rad
     left_out, _ = held_out_points(both(maps.lidar_m, maps.mono_m, maps.usable), elevation_rad, number)
-    aligned = align(np.where(left_out, np.float32(0), maps.lidar_m), maps.mono_m, maps.usable, options.align).mono_m
+    kept_m = np.where(left_out, np.float32(0), maps.lidar_m)
+    aligned = align(kept_m, maps.mono_m, maps.usable, options.align, drive_fit).mono_m
     evaluated = _some(left_out & (motion_m > 0) & (aligned > 0), _EVALUATED_A_FRAME, np.random.default_rng([9, number]))
     true_m = maps.lidar_m[evaluated]
     errors = np.stack([np.abs(found[evaluated] - true_m) / true_m for found in (motion_m, aligned)])
@@ -429,6 +449,7 @@ def measure_frame(
     usable: NDArray[np.bool_],
     view: RayAngles,
     options: PriorOptions,
+    drive_fit: Fit | None = None,
     far_seen_m: NDArray[np.float32] | None = None,
     depth_source: str = INTEGRATED,
     motion: MotionMap | None = None,
@@ -436,9 +457,9 @@ def measure_frame(
 ) -> MeasuredFrame:
     """Hold out some of a frame's LiDAR points, make its prior of the rest, and compare.
 
-    Maps are H×W: distances as they came, 0 = none; `usable` is True where the picture may be used. `far_seen_m` is what
-    the LiDAR points of other frames show above this one's. The frame's number in the calibration decides what is left
-    out.
+    Maps are H×W: distances as they came, 0 = none; `usable` is True where the picture may be used. `drive_fit` is
+    what frames with few LiDAR points take, here as in the prior. `far_seen_m` is what the LiDAR points of other frames
+    show above this one's. The frame's number in the calibration decides what is left out.
 
     Raises:
         InputError: the maps differ in size.
@@ -449,8 +470,8 @@ def measure_frame(
     kept_m = np.where(left_out, np.float32(0), lidar_m)
     # a source alone is not aligned, in the prior either
     mode = "none" if depth_source == "mono" else options.align
-    aligned = align(kept_m, mono_m, usable, mode)
-    frame = integrate_frame(kept_m, mono_m, usable, depth_source, options, motion=motion, device=device)
+    aligned = align(kept_m, mono_m, usable, mode, drive_fit)
+    frame = integrate_frame(kept_m, mono_m, usable, depth_source, options, drive_fit, motion, device)
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.lidar_points, view.theta_rad)
     measured_m, measured = lidar_m, left_out
     if far_seen_m is not None and lidar_points.any():
@@ -461,7 +482,6 @@ def measure_frame(
     # of a prior that keeps its points; where none is kept (mono alone), or all are averaged, there is no such pixel
     found, error_by_neighbours = error_of_lidar_points(lidar_m, frame.lidar_points)
     kept = _some(found & options.integration.keep_returns, _EVALUATED_A_FRAME, rng)
-    for_the_drive = _some(lidar_points, _FOR_THE_DRIVE_A_FRAME, rng)
 
     def error(estimate_m: NDArray[np.float32]) -> float | None:
         if not in_blocks.any():
@@ -470,14 +490,12 @@ def measure_frame(
 
     count = int(lidar_points.sum())
     # near the least number those left out decide whose fit it is; the prior has all of them
-    fitted = aligned if count >= 2 * LEAST_POINTS else align(lidar_m, mono_m, usable, mode)
+    fitted = aligned if count >= 2 * LEAST_POINTS else align(lidar_m, mono_m, usable, mode, drive_fit)
     return MeasuredFrame(
         FrameAlignment(name, count, fitted.fit_of, fitted.fit, error(mono_m), error(aligned.mono_m)),
         Errors.of(features, evaluated, frame.distance_m, measured_m),
         Errors({feature: values[kept] for feature, values in features.items()}, error_by_neighbours[kept]),
         view.elevation_rad[usable & (lidar_m > 0)],
-        lidar_m[for_the_drive],
-        mono_m[for_the_drive],
         frame.from_motion[evaluated],
     )
 
@@ -489,6 +507,7 @@ def measure_beyond(
     usable: NDArray[np.bool_],
     view: RayAngles,
     options: PriorOptions,
+    drive_fit: Fit | None,
     motion: MotionMap,
     motion_sigma_m: NDArray[np.float32],
     left_out: NDArray[np.bool_],
@@ -504,7 +523,8 @@ def measure_beyond(
     none = np.zeros_like(lidar_m)
     nowhere, everywhere = np.zeros_like(usable), np.ones_like(usable)
     by_motion = dataclasses.replace(motion, mono_counts=nowhere, alone=everywhere, around_m=None)
-    integrate = partial(integrate_frame, mask=usable, depth_source=INTEGRATED, options=options, device=device)
+    given = {"mask": usable, "depth_source": INTEGRATED, "options": options, "drive_fit": drive_fit}
+    integrate = partial(integrate_frame, **given, device=device)
     frame = integrate(none, none, motion=by_motion)
     features = pixel_features(frame.distance_m, frame.spread_m, frame.mono_m, frame.lidar_points, view.theta_rad)
     of_motion = motion_features(features, motion.distance_m, motion_sigma_m, view.elevation_rad)
@@ -542,21 +562,17 @@ def _some(pixels: NDArray[np.bool_], most: int, rng: np.random.Generator) -> tup
 
 def combine(
     frames: Sequence[MeasuredFrame],
-    options: PriorOptions,
     made_of: str,
     everywhere: bool,
-    depth_source: str = INTEGRATED,
+    drive_fit: Fit | None = None,
     motion_errors: tuple[float, float] | None = None,
 ) -> Calibration:
     """Put the measurements of a drive's frames, at least one, together.
 
     The key `made_of` is kept in the result; `everywhere` says whether the monocular maps are to be trusted beyond
-    LiDAR's field of elevation, and `motion_errors` by which errors of motion and of these maps motion took part in the
-    frames' priors.
+    LiDAR's field of elevation; `drive_fit` is that of `fit_of_drive`. `motion_errors` are the errors of motion and of
+    these maps by which motion took part in the frames' priors.
     """
-    lidar_m, mono_m = (np.concatenate([getattr(frame, name) for frame in frames]) for name in ("lidar_m", "mono_m"))
-    aligned = options.align != "none" and depth_source == INTEGRATED
-    drive_fit = fit_logs(lidar_m, mono_m) if aligned and len(lidar_m) >= LEAST_POINTS else None
     errors = Errors.together([frame.errors for frame in frames])
     motion = None
     if motion_errors is not None:
@@ -575,13 +591,7 @@ def combine(
         field_rad=_field_rad([frame.elevation_rad for frame in frames]),
         everywhere=everywhere,
         drive_fit=drive_fit,
-        frames=tuple(
-            # what the prior of a frame with few returns will take
-            dataclasses.replace(found, fit_of="drive", fit=drive_fit)
-            if drive_fit is not None and found.returns < LEAST_POINTS
-            else found
-            for found in (frame.alignment for frame in frames)
-        ),
+        frames=tuple(frame.alignment for frame in frames),
         motion=motion,
     )
 
