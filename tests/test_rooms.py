@@ -24,7 +24,7 @@ MOST_LINES = {
     "edge_depth_nerf/kernels": 3_745,
     "edge_depth_nerf/lidar": 1_770,
     "edge_depth_nerf/masks": 1_185,
-    "edge_depth_nerf/method": 3_140,
+    "edge_depth_nerf/method": 3_145,
     "edge_depth_nerf/mono": 3_860,
     "edge_depth_nerf/plugin": 5_030,
     "edge_depth_nerf/plugin/fused": 685,
