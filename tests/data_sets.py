@@ -221,8 +221,8 @@ def nuscenes(root: Path) -> Path:
 
 def argoverse2(root: Path) -> Path:
     """Write a log; give its folder."""
-    import pyarrow  # pyrefly: ignore[missing-import]
-    from pyarrow import feather  # pyrefly: ignore[missing-import]
+    import pyarrow
+    from pyarrow import feather
 
     def write(path: Path, **columns: Any) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -167,6 +167,7 @@ def test_workers_are_not_lost_for_ever(tmp_path: Path, monkeypatch: pytest.Monke
             do_tasks([task], place, QUIET)
 
 
+@pytest.mark.slow
 def test_the_local_cluster_is_closed_to_others(tmp_path: Path) -> None:
     """Other users of the machine reach the loopback, too: without the keys they get no answer."""
 

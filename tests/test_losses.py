@@ -243,9 +243,9 @@ def test_the_sky_loss_is_the_mean_share_that_is_stopped():
 
 def test_far_distances_in_half_precision_are_computed_in_float32():
     weights, edges = torch.tensor([[0.2, 0.7]]).half(), torch.tensor([[899.0, 901.0, 903.0]]).half()
-    given = weights, edges[:, :-1], edges[:, 1:], torch.tensor([902.0]).half(), torch.tensor([901.5]).half()
-    found = losses.urban_nerf_loss_of_nerfstudio(*given, 3.0)
-    whole = losses.urban_nerf_loss_of_nerfstudio(*(each.float() for each in given), 3.0)
+    given = [weights, edges[:, :-1], edges[:, 1:], torch.tensor([902.0]).half(), torch.tensor([901.5]).half()]
+    found = losses.urban_nerf_loss_of_nerfstudio(*given, sigma_m=3.0)
+    whole = losses.urban_nerf_loss_of_nerfstudio(*[each.float() for each in given], sigma_m=3.0)
     assert found.dtype == torch.float32 and found.item() == whole.item()
 
 

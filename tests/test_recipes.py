@@ -1,7 +1,6 @@
 """The recipes for data sets (docs/examples/*_to_rig.py): small drives in the layouts that are published become scenes
 whose LiDAR lies where it is."""
 
-import importlib.util
 import re
 import subprocess
 import sys
@@ -21,13 +20,9 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs/rig.md"
-NEEDS_PYARROW = pytest.mark.skipif(
-    importlib.util.find_spec("pyarrow") is None, reason="pyarrow is missing, which reads .feather"
-)
-RECIPES = ["nuscenes", pytest.param("argoverse2", marks=NEEDS_PYARROW), "ddad"]
 
 
-@pytest.fixture(scope="module", params=RECIPES)
+@pytest.fixture(scope="module", params=["nuscenes", "argoverse2", "ddad"])
 def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write the data set, and run the recipe as the page types it, with other folders."""
     folder = tmp_path_factory.mktemp(request.param)

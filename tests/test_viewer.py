@@ -192,7 +192,7 @@ def test_colours_of_clouds(pipeline):
     assert np.array_equal(cloud.colours("picture"), cloud.rgb)
     by_sigma = cloud.colours("sigma").astype(int).sum(1)
     assert by_sigma[cloud.sigma_m.argmax()] > by_sigma[cloud.sigma_m.argmin()]
-    assert (cloud.colours("sigma")[cloud.sigma_m.argmin()] == SIGMA.colours[0]).all() or cloud.sigma_m.min() > SIGMA.low
+    assert np.array_equal(cloud.colours("sigma"), SIGMA.coloured(cloud.sigma_m, cloud.sigma_m > 0))
     lowest, highest = (cloud.colours("height")[index].astype(int) for index in
                        (cloud.height_m.argmin(), cloud.height_m.argmax()))  # fmt: skip
     assert lowest[2] > lowest[0] and highest[0] > highest[2]

@@ -1,4 +1,4 @@
-"""What the detail of training pictures adds to views: unseen drives, equal seconds, and a real drive.
+"""What the detail of training pictures adds to views: unseen drives, and a real drive.
 
     python -m benchmarks.quality.detail --scenes scenes --output detail --jobs 2
     python -m benchmarks.quality.detail --page docs/results.md
@@ -7,9 +7,7 @@
 `real_drive.py` processes it. In folders of their own under `--output`, all with `compare --detail`:
 
     claims          nerfacto, the best rival with our prior and extras, and ours: 2,000 steps
-    seconds         the best rival without extras, for as many steps as unseen.json.xz has of it
     real            nerfacto, the DS-NeRF loss on LiDAR and ours on the real drive: 1,000 steps
-    real_seconds    there, the DS-NeRF loss for as many steps as real_drive_seconds.json.xz has of it
 
 λ and σ are those of the kept searches. Each run is evaluated twice: as the model renders, and with detail. To resume a
 stopped run, start the same command again. At its end it keeps all runs in detail.json.xz and detail_real.json.xz.
@@ -30,7 +28,7 @@ from edge_depth_nerf.base.files import write_text
 from edge_depth_nerf.compare.options import MethodName
 
 HERE = Path(__file__).parent
-KEPT = {HERE / "detail.json.xz": ("claims", "seconds"), HERE / "detail_real.json.xz": ("real", "real_seconds")}
+KEPT = {HERE / "detail.json.xz": ("claims",), HERE / "detail_real.json.xz": ("real",)}
 """Which folders' runs are kept in which file."""
 REAL = "kitti360_half"
 REAL_STEPS = GRIDS_STEPS
@@ -41,21 +39,14 @@ PART = "detail"
 """The page's part."""
 
 
-def longer(kept: str, but: Iterable[int]) -> tuple[MethodName, int]:
-    """The rival of a kept comparison at equal seconds, and its steps, which no other method has."""
-    runs = [run for run in results_of(HERE / f"{kept}.json.xz").runs if run.content["steps"] not in but]
-    assert len({(run.method, run.content["steps"]) for run in runs}) == 1
-    return runs[0].method, runs[0].content["steps"]
-
-
 def table() -> str:
     """PSNR without and with detail, means over the drives, as Markdown."""
     on_rendered, on_real = (results_of(file) for file in KEPT)
     lines = [row("method", "real", "real, with detail", "rendered", "rendered, with detail"), "|---" * 5 + "|"]
     for method in (CLAIMS[0], OF_REAL[1], *CLAIMS[1:]):
         cells = []
-        for results, name, steps in ((on_real, RECORDED, REAL_STEPS), (on_rendered, TRUE, STEPS)):
-            runs = [run for run in of(results, [method]).runs if run.content["steps"] == steps]
+        for results, name in ((on_real, RECORDED), (on_rendered, TRUE)):
+            runs = of(results, [method]).runs
             cells += [figures_of(runs, metric) if runs else "–" for metric in (name, f"detail_{name}")]
         lines.append(row(title_of(method), *cells))
     return "\n".join(lines)
@@ -82,13 +73,9 @@ def main() -> None:
         ours("compare", *where, "--methods", *methods, *of_run, "--output", out / folder)
 
     real = [options.scenes / REAL]
-    rival, rivals_steps = longer("unseen", (STEPS, GRIDS_STEPS))
-    of_real, of_reals_steps = longer("real_drive_seconds", (REAL_STEPS,))
     for seed in options.seeds:
         compare("claims", scenes, CLAIMS, STEPS, seed)
-        compare("seconds", scenes, [rival], rivals_steps, seed)
         compare("real", real, OF_REAL, REAL_STEPS, seed)
-        compare("real_seconds", real, [of_real], of_reals_steps, seed)
     for file, folders in KEPT.items():
         keep(file, *(out / folder for folder in folders))
 

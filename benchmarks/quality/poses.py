@@ -3,15 +3,11 @@
     edge-depth-nerf synthesize --output outputs/street --scene street
     python -m benchmarks.quality.poses odometry outputs/street outputs/turn
     python -m benchmarks.quality.poses colmap outputs/street --frames 12
-    python -m benchmarks.quality.poses refined outputs/street outputs/rig
 
 odometry   The path is laid on the true one by its first pose, as for a vehicle that knows only where it began. The
            table has the errors of the end and the largest one, as shares of the path, and those of single steps.
 colmap     Errors of the camera centres after a similarity to the true ones (Umeyama, PAMI 1991), as a share of the
            path; the error of the scale is that of the unchanged poses. The ego mask is not given.
-refined    Each pose is disturbed by itself: normal shifts and turns whose length has the given standard deviation. The
-           error of a step is that of the motion from one frame to the next. That of the path is of the camera centres
-           after a rigid alignment. Epipolar medians are of features that took no part.
 """
 
 from __future__ import annotations
@@ -29,20 +25,14 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from edge_depth_nerf.lidar.trajectory import Trajectory
 from edge_depth_nerf.process.colmap.poses import colmap_poses
-from edge_depth_nerf.process.colmap.refine import refine_poses
 from edge_depth_nerf.process.converters import read_drive
 from edge_depth_nerf.process.lidar_poses import check_sweeps, path_of
 from edge_depth_nerf.process.options import Kitti360Options, ProcessOptions, RigOptions
-from edge_depth_nerf.process.recording import Recording
 
-NOISES = ((0.0, 0.0), (1.0, 0.03), (3.0, 0.1), (10.0, 0.3))
-"""cm and degrees."""
 COLUMNS = {
     "odometry": ("sweeps", "path m", "end %", "most %", "step mm", "most", "step °", "most", "s a sweep"),
     "colmap": ("pictures", "registered", "path m", "centres max %", "median %", "scale error %", "spread %", "s"),
-    "refined": ("noise", "step cm", "step °", "path cm", "what refine-poses says"),
 }
 Row = tuple[str, ...]
 Poses = NDArray[np.float64]
@@ -117,43 +107,6 @@ def colmap(options: ProcessOptions, console: Console) -> Iterator[Row]:
     )
 
 
-def disturbed(recording: Recording, shift_m: float, turn_deg: float) -> Recording:
-    """The recording with other poses: each shifted and turned in a random direction, by so much root mean square."""
-    rng, path = np.random.default_rng(0), recording.trajectory
-    assert path is not None
-    wrong = np.tile(np.eye(4), (len(path.times_s), 1, 1))
-    turns = rng.normal(0, np.radians(turn_deg) / np.sqrt(3), (len(wrong), 3))
-    wrong[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
-    wrong[:, :3, 3] = rng.normal(0, shift_m / np.sqrt(3), (len(wrong), 3))
-    pictures = tuple(dataclasses.replace(picture, camera_to_world=None) for picture in recording.pictures)
-    return dataclasses.replace(
-        recording, trajectory=Trajectory(path.times_s, path.vehicle_to_world @ wrong), pictures=pictures
-    )
-
-
-def errors(found: Recording, truth: Recording) -> tuple[float, float, float]:
-    """Of the steps, mean, cm and degrees; of the path, mean, cm."""
-    both = [np.stack([one.pose(picture) for picture in one.pictures]) for one in (found, truth)]
-    cameras = np.array([picture.camera for picture in truth.pictures])
-    each = [off(*(poses[cameras == name] for poses in both)) for name in np.unique(cameras)]
-    shift_m, turn_deg = (np.concatenate(parts).mean() for parts in zip(*each, strict=True))
-    ours, true = turned_over(*(poses[:, :3, 3] for poses in both))
-    apart_m = np.linalg.norm(ours - true, axis=-1)
-    return 100 * float(shift_m), float(turn_deg), 100 * float(apart_m.mean())
-
-
-def refined(options: ProcessOptions, console: Console) -> Iterator[Row]:
-    truth = read_drive(options)
-    for shift_cm, turn_deg in NOISES:
-        given = disturbed(truth, shift_cm / 100, turn_deg) if shift_cm else truth
-        found = refine_poses(given, options, console)
-        cells = [
-            f"{before:.{digits}f} → {after:.{digits}f}"
-            for before, after, digits in zip(errors(given, truth), errors(found, truth), (2, 3, 2), strict=True)
-        ]
-        yield f"{shift_cm:g} cm, {turn_deg:g}°", *cells, found.notices[-1]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=COLUMNS)
@@ -162,7 +115,7 @@ def main() -> None:
     arguments = parser.parse_args()
     console = Console(width=160)
     table = Table("drive", *COLUMNS[arguments.what], title=f"Poses against the truth: {arguments.what}")
-    evaluate = {"odometry": odometry, "colmap": colmap, "refined": refined}[arguments.what]
+    evaluate = {"odometry": odometry, "colmap": colmap}[arguments.what]
     for drive in arguments.drives:
         with tempfile.TemporaryDirectory() as folder:
             for row in evaluate(options_of(drive, Path(folder) / "scene", arguments.frames), console):

@@ -1,11 +1,11 @@
 """What distances from motion are worth: our method with them and without, on drives of four kinds.
 
-    python -m benchmarks.quality.reach --output outputs/reach --size 256 --frames 24 --steps 1000
+    python -m benchmarks.quality.reach --output outputs/reach
 
 Each drive is rendered, processed with and without `--no-motion`, and trained alike, with lambda and sigma of
 tuned.json. The table has figures of held-out pictures, and of views 1 m beside the path. Nothing was chosen on these
-drives: their seeds (`DRIVES`) were written down before anything was run, and no other measurement uses a seed of 200 or
-more. Writes table.md and table.json. A stopped run resumes with the same command.
+drives: their seeds (`DRIVES`) were written down before anything was run. Writes table.md and table.json. A stopped run
+resumes with the same command.
 """
 
 from __future__ import annotations
@@ -63,14 +63,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=Path("outputs/reach"))
     parser.add_argument("--kinds", nargs="+", choices=DRIVES, default=list(DRIVES))
-    parser.add_argument("--frames", type=int, default=40)
-    parser.add_argument("--size", type=int, default=350, help="of the pictures, in pixels")
-    parser.add_argument("--steps", type=int, help="of each training; the preset's, if not set")
+    parser.add_argument("--frames", type=int, default=24)
+    parser.add_argument("--size", type=int, default=256, help="of the pictures, in pixels")
+    parser.add_argument("--steps", type=int, default=1000, help="of each training")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
     options = parser.parse_args()
     compared = options.output / "compared"
-    steps = ("--steps", options.steps) if options.steps else ()
-    common = ("--methods", "edge", "--tuned", TUNED, "--output", compared, "--jobs", options.jobs, *steps)
+    where = ("--output", compared, "--jobs", options.jobs, "--steps", options.steps)
+    common = ("--methods", "edge", "--tuned", TUNED, *where)
     done: dict[str, int] = {}
     for kind in options.kinds:
         ours("compare", *make_scenes(kind, DRIVES[kind], options), *common)

@@ -5,7 +5,7 @@
 
 Each argument is a recording that `process rig` reads (docs/results.md says which), @2: at half size. It is processed
 with every sixth frame held out with its LiDAR, and a tenth of the LiDAR's beams held out of all sweeps. λ and σ are
-those that a search on a rendered drive found (tuned.json), for all methods alike; nothing is chosen on these drives.
+those that a search on a rendered drive found (tuned.json), for all methods alike.
 Then the rival without our prior that has the best PSNR is trained once more on each drive, for as many steps as ours'
 processor seconds allow, its learning rates falling over these. Then, with the first seed and drive, methods that differ
 from ours in extras or prior alone. Writes table.md, table.json and views_SCENE.png. To resume a stopped run, start the

@@ -2,13 +2,11 @@
 
     python -m benchmarks.robustness.lidar --output outputs/lidar
 
-Synthesises a street at KITTI-360's picture size, and one with traffic at a quarter of it (some ten minutes the first
-time), then prints
+Synthesises a street at KITTI-360's picture size (some ten minutes the first time), then prints
 
   de-skewing   distance of each LiDAR point from where it truly was, raw and de-skewed;
   projection   of the pixels with a LiDAR point, how many are wrong: more than 5 % outside the true distances of the 3×3
-               pixels around; how many of the right ones are kept when what is hidden or has moved is left out;
-  what moves   the same with traffic, with and without the check for free space.
+               pixels around; how many of the right ones are kept when what is hidden or has moved is left out.
 """
 
 from __future__ import annotations
@@ -122,13 +120,13 @@ class Counts:
 COLUMNS = (*(f"wrong: {kind}" for kind in KINDS), "right ones kept", "cover: all", "kept")
 
 
-def evaluate(made: SynthesizeOptions, reach: int, every: int, *, free_space: bool = True) -> dict[str, Counts]:
+def evaluate(made: SynthesizeOptions, reach: int, every: int) -> dict[str, Counts]:
     """Project the sweeps that training pictures get, and compare the maps with the truth."""
     found = read_kitti360(options(made, reach))
     held_out = {frame for frame in range(made.frames) if frame % HOLDOUT_EVERY == HOLDOUT_EVERY // 2}
     stores = {kind: SweepStore(found, options(made, reach, raw_lidar=kind == "recorded"), held_out) for kind in KINDS}
     for kind, store in stores.items():
-        for scanner in store.scanners if kind != "kept" or not free_space else ():
+        for scanner in store.scanners if kind != "kept" else ():
             scanner.moved = partial(nothing_moved, scanner)
     masks = {recorded.name: read_mask(made.output / f"truth/masks/{recorded.name}.png") for recorded in found.cameras}
     counts = {name: Counts() for name in masks}
@@ -160,16 +158,6 @@ def projection(made: SynthesizeOptions) -> Table:
     return table
 
 
-def moving(made: SynthesizeOptions) -> Table:
-    title = f"Traffic, {made.size}×{made.size} px"
-    table = Table("K", "free space", "camera", *COLUMNS, title=title)
-    for reach in (3, 5):
-        for free_space in (True, False):
-            for name, counts in evaluate(made, reach, 1, free_space=free_space).items():
-                table.add_row(str(reach), "checked" if free_space else "not checked", name, *counts.row())
-    return table
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=Path("outputs/lidar"))
@@ -179,10 +167,8 @@ def main() -> None:
     torch.set_num_threads(1)
     console = Console(width=120)
     street = drive(arguments.output / "street", scene="street", frames=arguments.frames, size=arguments.size)
-    cars = drive(arguments.output / "traffic", scene="traffic", frames=24, size=arguments.size // 4)
     console.print(deskewing(street))
     console.print(projection(street))
-    console.print(moving(cars))
 
 
 if __name__ == "__main__":

@@ -130,7 +130,7 @@ def main() -> None:
                 *(sys.executable, "-m", "edge_depth_nerf", "process", "kitti360"),
                 *("--root", str(folder / "drive"), "--sequence", sequence),
                 *("--output", str(folder / "scene"), "--mono", str(folder / f"drive/simulated_mono/{sequence}")),
-                *("--sweeps", str(options.sweeps)),
+                *("--sweeps", str(options.sweeps), "--no-motion"),
             ]
         )
         training = watched([sys.executable, "-c", TRAIN, str(folder / "scene")])

@@ -254,7 +254,7 @@ def splats(settings: Settings) -> Found:
 
 def steps(settings: Settings) -> Found:
     """Milliseconds of a step of ours, as it is and without graphs, and of nerfacto in torch, in turns."""
-    from benchmarks.speed import turns
+    from benchmarks.speed import report, turns
 
     count, rounds = (1, 1) if settings.fake else (20, 2)
     names = [turns.REFERENCE, "ours", *([] if settings.fake else [turns.EAGER])]
@@ -267,7 +267,8 @@ def steps(settings: Settings) -> Found:
         early, late = ([1e3 * taken for taken in part] for part in (each["step_s"][:rounds], each["step_s"][rounds:]))
         row = {"trainer": name, "ms a step, early": early, "ms a step, late": late}
         row["rays/s, late"] = 1e3 * rays / statistics.median(late)
-        row |= {"× nerfacto in torch, late": each["step_ratio"][rounds:], "graphs": each["graphs"]}
+        faster = report.ratios(found[turns.REFERENCE]["step_s"], each["step_s"])
+        row |= {"× nerfacto in torch, late": faster[rounds:], "graphs": each["graphs"]}
         rows.append(row)
     return {"rays": rays, "early, from step": firsts[0], "late, from step": LATE, "rows": rows}
 

@@ -4,8 +4,7 @@ The pictures, masks and maps of a scene are linked under new names until there a
 size, and the scene is calibrated anew, as `process` leaves it. Each DataManager is built in a process of its own, on
 the CPU, and gives ten batches of 4,096 rays. Then the anonymous memory of the process is read (RssAnon: a memory-mapped
 file does not count, because the system takes it back when others need memory). "begun" is the same process before
-anything was read. Ours gives ten batches more after the system was told to forget its pixel table, as if it were larger
-than memory: "cold". VanillaDataManager of nerfstudio keeps all pictures as float32; it reads no depth here.
+anything was read. VanillaDataManager of nerfstudio keeps all pictures as float32; it reads no depth here.
 """
 
 from __future__ import annotations
@@ -28,13 +27,6 @@ def anonymous_mb() -> float:
         if line.startswith("RssAnon"):
             return int(line.split()[1]) / 1024
     raise RuntimeError("no RssAnon in /proc/self/status")
-
-
-def forget(path: Path) -> None:
-    """Let the system drop what it holds of a file in memory."""
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
 
 
 def multiplied(scene: Path, frames: int, folder: Path) -> None:
@@ -91,22 +83,12 @@ def build(which: str, scene: Path) -> dict[str, float]:
     manager = config.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
     manager.next_train(0)
     ready_s = time.perf_counter() - started
-    started = time.perf_counter()
     for step in range(BATCHES):
         manager.next_train(step + 1)
-    batch_s = (time.perf_counter() - started) / BATCHES
-    found = {"begun_mb": before, "anonymous_mb": anonymous_mb(), "first_batch_s": ready_s, "batch_s": batch_s}
+    found = {"begun_mb": before, "anonymous_mb": anonymous_mb(), "first_batch_s": ready_s}
     tables = list((scene / ".cache" / "pixels").glob("*.npy"))
     if which == "ours" and tables:
         found["table_mb"] = sum(path.stat().st_size for path in tables) / 2**20
-        cold_s = 0.0
-        for step in range(BATCHES):
-            for path in tables:
-                forget(path)
-            started = time.perf_counter()
-            manager.next_train(BATCHES + step + 1)
-            cold_s += time.perf_counter() - started
-        found["cold_batch_s"] = cold_s / BATCHES
     return found
 
 
@@ -120,4 +102,6 @@ def measured(which: str, scene: Path) -> dict[str, float]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     print("\n" + json.dumps(build(sys.argv[1], Path(sys.argv[2]))))

@@ -6,7 +6,7 @@ Parts, each of which is kept in the results, with the commit and the machine it 
 measured again (remove it there, or the file, to have it anew):
 
     lite, full   training steps and views of the two presets (turns.py)
-    frames       first batch, batch (also from a cold disk) and memory over the number of pictures of 350 px
+    frames       first batch and memory over the number of pictures of 350 px
     memory       300 pictures of 1400 px (memory.py)
     preparation  `process` and integration on one core and on all
 
@@ -95,11 +95,11 @@ def most_memory(work: Path) -> dict[str, Any]:
             memory.multiplied(large, frames, folder)
             hosts[frames] = memory.measured("nerfstudio", folder)
     slope_mb = (hosts[60]["anonymous_mb"] - hosts[20]["anonymous_mb"]) / 40
-    found["nerfstudio"] = {"computed_mb": hosts[60]["anonymous_mb"] + slope_mb * 240, "mb_a_picture": slope_mb}
+    of_60_mb = hosts[60]["anonymous_mb"] - hosts[60]["begun_mb"]
+    found["nerfstudio"] = {"computed_mb": of_60_mb + slope_mb * 240, "mb_a_picture": slope_mb}
     with temporary(work) as folder:
         memory.multiplied(large, 300, folder)
         found["ours"] = memory.measured("ours", folder)
-        found["ours, again"] = memory.measured("ours", folder)
     return found
 
 

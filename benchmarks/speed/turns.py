@@ -3,16 +3,16 @@
     python -m benchmarks.speed.turns [--scene data/sample_drive] [--preset lite full] [--rounds 5] [--steps 10]
                                      [--json FILE] [--beside CHECKOUT]
 
-Four trainers with the same sizes (levels, table, samples, rays, chunk; pose refinement off) on the same scene:
-nerfstudio's nerfacto and depth-nerfacto with its own DataManager and its torch implementation, and ours with the torch
-implementation and with its fused kernels; if asked for, ours without CUDA graphs, too. (nerfstudio's nerfacto would
-read ahead in other processes, which two cores do not have; VanillaDataManager, its other one, is used for both.) Each
-round, every trainer makes the same number of whole training iterations (batch, forward, losses, backward, optimisers,
-schedulers) in turn, at steps spread over the whole schedule, since proposal networks are trained less often later. A
-held-out view, or as many of its rows as `--view-rays` allows, is rendered by each in turn, too. Ratios are taken within
-a round: what else the machine does hits all of them. Median and range over the rounds. Each trainer has a process of
-its own, which sleeps while it is another's turn. With `--beside` one more is the code of another checkout (`git
-worktree add`), with the configuration of this one: whether a change made a step faster or slower is read in one run.
+Trainers with the same sizes (levels, table, samples, rays, chunk; pose refinement off) on the same scene: nerfstudio's
+nerfacto with its own DataManager and its torch implementation, and ours; if asked for, ours without CUDA graphs, too.
+(nerfstudio's nerfacto would read ahead in other processes, which two cores do not have; VanillaDataManager, its other
+one, is used.) Each round, every trainer makes the same number of whole training iterations (batch, forward, losses,
+backward, optimisers, schedulers) in turn, at steps spread over the whole schedule, since proposal networks are trained
+less often later. A held-out view, or as many of its rows as `--view-rays` allows, is rendered by each in turn, too.
+Ratios are taken within a round: what else the machine does hits all of them. Median and range over the rounds. Each
+trainer has a process of its own, which sleeps while it is another's turn. With `--beside` one more is the code of
+another checkout (`git worktree add`), with the configuration of this one: whether a change made a step faster or slower
+is read in one run.
 """
 
 from __future__ import annotations
@@ -41,22 +41,20 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.models.depth_nerfacto import DepthNerfactoModelConfig
 from nerfstudio.models.nerfacto import NerfactoModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
 import edge_depth_nerf
+from benchmarks.speed.report import ratios
 from edge_depth_nerf.plugin import config as ours
 from edge_depth_nerf.plugin.compat import lpips_not_built
 
 PRESETS: dict[str, Any] = {"lite": ours.edge_depth_nerf_lite, "full": ours.edge_depth_nerf}
-HOST = {"nerfacto": NerfactoModelConfig, "depth-nerfacto": DepthNerfactoModelConfig}
 EAGER = "ours, without CUDA graphs"
 BESIDE = "ours, other checkout"
-OURS = {"ours, torch": "torch", "ours": "fused", BESIDE: "fused", EAGER: "fused"}
-ON_EVERY_MACHINE = ("nerfacto", "depth-nerfacto", "ours, torch", "ours")
 REFERENCE = "nerfacto"
+ON_EVERY_MACHINE = (REFERENCE, "ours")
 WARM_UPS = 50
 """So many steps are made on a GPU before any is timed."""
 KINDS_OF_STEPS = 2
@@ -178,9 +176,8 @@ def configurations(
     change(base)
     found = {}
     for name in names:
-        if name in OURS:
+        if name != REFERENCE:
             found[name] = copy.deepcopy(base)
-            found[name].pipeline.model.implementation = OURS[name]
             found[name].cuda_graphs = name != EAGER
             continue
         config: Any = copy.deepcopy(method_configs["depth-nerfacto"])
@@ -189,11 +186,10 @@ def configurations(
             for field in dataclasses.fields(NerfactoModelConfig)
             if field.name not in ("_target", "implementation")
         }
-        config.pipeline.model = HOST[name](**shared, implementation="torch")
+        config.pipeline.model = NerfactoModelConfig(**shared, implementation="torch")
         data = config.pipeline.datamanager
         data.dataparser = NerfstudioDataParserConfig(data=scene, depth_unit_scale_factor=1 / 256)
-        if name == "nerfacto":
-            data._target = VanillaDataManager[InputDataset]
+        data._target = VanillaDataManager[InputDataset]
         data.train_num_rays_per_batch = base.pipeline.datamanager.train_num_rays_per_batch
         config.mixed_precision = base.mixed_precision
         config.max_num_iterations = base.max_num_iterations
@@ -224,8 +220,7 @@ def race(
     schedule's steps that rounds begin with; without it the steps of all rounds are spread over the schedule.
 
     Returns:
-        Of each: rays_per_second (median), seconds of a step and of the rows of a view in each round, and the
-        reference's seconds over its own.
+        Of each: rays_per_second (median), and seconds of a step and of the rows of a view in each round.
     """
     some = next(iter(configs.values()))
     rays, schedule = some.pipeline.datamanager.train_num_rays_per_batch, some.max_num_iterations
@@ -252,16 +247,13 @@ def race(
     graphs = {name: contestant.ask("graphs", None) for name, contestant in contestants.items()}
     for contestant in contestants.values():
         contestant.stop()
-    reference = contestants[REFERENCE]
     return {
         name: {
             "rays_per_second": rays / statistics.median(contestant.step_s),
             "step_s": contestant.step_s,
-            "step_ratio": [a / b for a, b in zip(reference.step_s, contestant.step_s, strict=True)],
             "graphs": graphs[name],
             "rendered_px": contestant.rendered_px,
             "render_s": contestant.render_s,
-            "render_ratio": [a / b for a, b in zip(reference.render_s, contestant.render_s, strict=True)],
         }
         for name, contestant in contestants.items()
     }
@@ -311,8 +303,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", type=Path, default=Path("data/sample_drive"))
     parser.add_argument("--preset", nargs="+", default=["lite"], choices=list(PRESETS))
-    choices = [*HOST, *OURS]
-    choices.remove(BESIDE)
+    choices = [*ON_EVERY_MACHINE, EAGER]
     parser.add_argument("--contestants", nargs="+", default=ON_EVERY_MACHINE, choices=choices)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=10)
@@ -328,14 +319,15 @@ def main() -> None:
         table = Table(
             "", "rays/s", "s a step", "× nerfacto", "s a view", "× nerfacto", title=f"{preset}, {options.scene}"
         )
+        host = results[preset][REFERENCE]
         for name, found in results[preset].items():
             table.add_row(
                 name,
                 f"{found['rays_per_second']:,.0f}",
                 spread_of(found["step_s"], ".3f"),
-                spread_of(found["step_ratio"], ".2f"),
+                spread_of(ratios(host["step_s"], found["step_s"]), ".2f"),
                 spread_of(found["render_s"], ".2f"),
-                spread_of(found["render_ratio"], ".2f"),
+                spread_of(ratios(host["render_s"], found["render_s"]), ".2f"),
             )
         CONSOLE.print(table)
     if options.json:

@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pyarrow import feather  # pyrefly: ignore[missing-import]
+from pyarrow import feather
 
 
 def rows(path: Path) -> list[dict[str, Any]]:

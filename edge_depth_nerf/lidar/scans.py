@@ -314,7 +314,7 @@ def _npz_header(path: Path, size: int, scan: ScanFormat) -> _Header:
 def _feather_table(path: Path, columns: list[str] | None = None) -> Any:
     """Open a table, its columns mapped into memory; compressed ones are unpacked when they are asked for."""
     with _faults_named(path):
-        from pyarrow import feather  # pyrefly: ignore[missing-import]
+        from pyarrow import feather
 
         return feather.read_table(path, columns=columns, memory_map=True)
 
