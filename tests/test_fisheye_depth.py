@@ -245,7 +245,9 @@ def test_keys_of_a_rig_file_are_known_where_its_lenses_are_read():
 def test_a_lens_that_the_views_cannot_be_cut_with_is_refused(folder):
     sheared = "3 -60 0 0.002\n1 0\n80 80\n1 0 0.2\n160 160\n"
     (folder / "calib_results.txt").write_text(sheared)
-    with pytest.raises(InputError, match=r"calib_results.txt: camera lens: .* by 9.* px rms"):
+    with pytest.raises(
+        InputError, match=r"calib_results.txt: a Kannala.* OCAM lens by 8.* px: expected at most 0\.5 px"
+    ):
         fisheye_depth(FisheyeDepthOptions(folder / "pictures", folder / "calib_results.txt", folder / "out"))
 
 

@@ -298,6 +298,10 @@ def test_coefficients_without_their_model_are_not_passed_over(mine: Path) -> Non
     (mine / "camchain.yaml").write_text(text.replace("  distortion_model: none\n", ""))
     with pytest.raises(InputError, match=r"cam0\.distortion_coeffs is \[-0\.01.*expected 0 numbers"):
         lens_of(mine, calibrated("camchain.yaml"))
+    # zeros say that there is none
+    edit(mine, (calibrated("camchain.yaml"), LENS))
+    (mine / "camchain.yaml").write_text(camchain("pinhole", "none", OPENCV, [0.0] * 4))
+    assert isinstance(lens_of(mine, calibrated("camchain.yaml")), Pinhole)
 
 
 def test_a_lens_keeps_its_limit_in_a_rig_file(mine: Path) -> None:

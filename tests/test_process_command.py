@@ -1,11 +1,10 @@
 """`process` as a whole: scene, monocular maps and their calibration by one command, each done once."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -185,10 +184,22 @@ def test_maps_that_are_brought_stay_until_others_are_put_in_whole(
     assert read_json(scene / "transforms.json")["mono"] == {"trained_on": "elsewhere"}
     # one file renewed: all are the drive's again, none is mixed in; a run that is stopped leaves this to be said
     (mono / "image_02/0000000002.png").touch()
-    with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
-        stopped.setattr("edge_depth_nerf.scene.writer.run_jobs", Mock(side_effect=KeyboardInterrupt))
-        run(options)
+    begun: list[int] = []
+
+    def stopped_at_two(jobs: Sequence[Callable[[], object]], *_: object) -> None:
+        begun.append(len(jobs))
+        for job in jobs[:2]:
+            job()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as stopped:
+        stopped.setattr("edge_depth_nerf.scene.writer.run_jobs", stopped_at_two)
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                run(options)
+    assert begun[1] == begun[0] - 2, "what was written is not written again"
     assert "of this scene are removed" in run(options)
+    assert not (scene / ".transforms.before.json").exists()
     assert distances(scene) == {9.0} and "mono" not in read_json(scene / "transforms.json")
 
 

@@ -1,4 +1,4 @@
-"""How near poses that `process` finds come to the truth of synthetic drives: COLMAP's, LiDAR odometry's, refined ones.
+"""How near poses that `process` finds come to the truth of synthetic drives: COLMAP's and LiDAR odometry's.
 
     edge-depth-nerf synthesize --output outputs/street --scene street
     python -m benchmarks.quality.poses odometry outputs/street outputs/turn

@@ -221,7 +221,7 @@ def integrate_frame(
         InputError: the maps differ in size.
     """
     anywhere, mask = mask, mask & ~(mono_m > FARTHEST_M)
-    # where the monocular map means "far" a LiDAR point counts with motion, as where it says nothing
+    # where the monocular map means "far" a LiDAR point counts beside motion, as where it says nothing
     lidar_points = (mask if motion is None else anywhere) & np.isfinite(lidar_m) & (lidar_m > 0)
     if depth_source == "mono":
         lidar_points = np.zeros_like(mask)

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32
 from rich.console import Console
 
 from edge_depth_nerf.base.console import progress_bars, run_jobs, say
-from edge_depth_nerf.base.errors import InputError, found_in
+from edge_depth_nerf.base.errors import InputError, require
 from edge_depth_nerf.base.files import (
     IMAGE_SUFFIXES,
     as_people_count,
@@ -45,7 +45,7 @@ from edge_depth_nerf.mono.pinhole_views import PinholeView, pinhole_views
 from edge_depth_nerf.mono.relative import Kind, Layer
 from edge_depth_nerf.scene.checks import check_picture_size
 from edge_depth_nerf.scene.put_maps import FARTHEST_M
-from edge_depth_nerf.scene.writer import SceneCamera, check_cameras
+from edge_depth_nerf.scene.writer import MAX_FIT_RMS_PX
 
 RECORD, VIEWS, DISTANCE, COLOURED, MADE_OF = "views.json", "views", "distance", "coloured", "made_of.json"
 FARTHEST = 100.0
@@ -157,9 +157,12 @@ def open_fisheyes(options: FisheyeDepthOptions) -> Fisheyes:
     for path in [*pictures, *([options.mask] if options.mask else [])]:
         check_picture_size(path, lens)
     if not isinstance(lens, KannalaBrandt | Pinhole):
-        with found_in(str(options.calibration)):
-            check_cameras([SceneCamera(options.camera or "lens", lens)], options.theta_max_deg)
-        lens = fit_kannala_brandt(lens, theta_max_rad).camera
+        fit = fit_kannala_brandt(lens, theta_max_rad)
+        off = (
+            f"{options.calibration}: a Kannala-Brandt camera differs from this {lens.model} lens by {fit.rms_px:.2f} px"
+        )
+        require(fit.rms_px <= MAX_FIT_RMS_PX, off, f"at most {MAX_FIT_RMS_PX} px rms. Use a smaller --theta-max-deg")
+        lens = fit.camera
     return Fisheyes(pictures, lens, theta_max_rad, read_mask(options.mask) if options.mask else None, options.mask)
 
 

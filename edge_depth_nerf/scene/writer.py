@@ -722,8 +722,8 @@ def _kept_later_maps(
         notices.append(
             f"The {of_what} of this scene are removed: one is missing, or pictures or masks are new. {remedy}"
         )
-        if name in layers:
-            # in their places belong the drive's
+        if name in layers and path.name == TRANSFORMS:
+            # in their places belong the drive's, some of which a run that was stopped may have written since
             for frame in frames:
                 (output / _frame_files(frame, layers)[name]).unlink(missing_ok=True)
             work = _pending(output, frames, shifted, layers)
