@@ -21,7 +21,7 @@ from edge_depth_nerf.method.error_model import (
     pixel_features,
     read_calibration,
 )
-from edge_depth_nerf.method.prior import PriorOptions, RayAngles, make_prior
+from edge_depth_nerf.method.prior import MotionMap, PriorOptions, RayAngles, make_prior
 from edge_depth_nerf.mono import calibration as calibration_module
 from edge_depth_nerf.mono.calibration import (
     calibrate_scene,
@@ -29,6 +29,7 @@ from edge_depth_nerf.mono.calibration import (
     find_calibration,
     fit_of_drive,
     held_out_points,
+    measure_beyond,
     measure_frame,
     points_of_both,
 )
@@ -203,6 +204,22 @@ def test_errors_of_frames_with_few_points_are_those_of_their_prior():
     off = np.abs(prior.distance_m - truth)[elsewhere]
     assert 0.9 < np.mean(off < 2 * prior.sigma_m[elsewhere]) <= 1
     assert np.median(prior.sigma_m[elsewhere] / truth[elsewhere]) < 0.02
+    # what motion is compared with, and what is known beyond LiDAR's field, are measured with it, too
+    motion = MotionMap(truth, 0.5, usable, ~usable)
+    beyond = measure_beyond(60, lidar, mono, usable, view, options, drive_fit, motion, 0.03 * truth, ~usable)
+    assert len(beyond.field.relative) > 2 and np.median(beyond.field.relative) < 0.02
+
+
+def test_motion_is_compared_with_maps_that_are_fitted_by_the_drive(tmp_path):
+    folder = with_motion(write_scene(tmp_path), 1.0)
+    change_map(folder, "mono_file_path", 0, lambda metres: metres / 2)
+    scene = read_scene(folder)
+    points = calibration_module._points_of_drive(scene, (0, scene.pictures[0]))
+    change_map(folder, "lidar_file_path", 0, lambda m: np.where(np.cumsum(m > 0).reshape(m.shape) < 50, m, 0))
+    scene = read_scene(folder)
+    drive_fit = fit_of_drive([points], PriorOptions())
+    of_both, _ = calibration_module._errors_of_both(scene, PriorOptions(), drive_fit, (0, scene.pictures[0]))
+    assert of_both.shape[1] > 2 and np.median(of_both[1]) < 0.01
 
 
 def test_blocks_rows_and_single_points_are_left_out():

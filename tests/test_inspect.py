@@ -489,6 +489,7 @@ def test_a_second_look_says_that_it_is_of_a_sample_and_leaves_no_sheets_of_the_f
     with monkeypatch.context() as stopped, pytest.raises(KeyboardInterrupt):
         stopped.setattr("edge_depth_nerf.inspecting.command.check_poses", Mock(side_effect=KeyboardInterrupt))
         look(drive, output, frames=50)
+    assert len([*output.glob("left_*.png")]) == 3
     for name in ("notes.png", "poses.png"):
         (output / name).write_bytes(b"mine, or of poses that are not checked any more")
     monkeypatch.setattr(figures, "MEASURED_PICTURES", 2)

@@ -195,8 +195,7 @@ def _table(path: Path, name: str) -> Camera:
     if unknown := [key for key in lens if key not in (*LENS, *LENS_NUMBERS, *LENS_PLACE, *BESIDE_LENS)]:
         hint = f" {RATIONAL}." if unknown[0] in ("k5", "k6") else ""
         raise InputError(f"{where}: {unknown[0]}: unknown key; docs/rig.md has those of a camera.{hint}")
-    keys = tuple(key for key in lens if key in (*LENS_NUMBERS, *LENS_PLACE) or key in LENS[1:])
-    keys += tuple(key for key in LENS[1:] if key not in lens)
+    keys = (*LENS[1:], *(key for key in (*LENS_NUMBERS, *LENS_PLACE) if key in lens))
     given: dict[str, Any] = _numbers([lens.get(key) for key in keys], keys, where)
     if any(given[side] % 1 for side in ("width", "height")):
         raise InputError(f"{where}: width and height are {lens['width']} and {lens['height']}, expected whole numbers.")

@@ -151,7 +151,7 @@ def run_demo(options: DemoOptions, console: Console | None = None) -> dict[str, 
 def _make(options: DemoOptions, stages: Stages, recorded: dict[str, Any], console: Console) -> dict[str, Any]:
     """Do all stages, show their tables, and write the page and the picture; give what results.json holds."""
     output, compared = options.folder, stages.comparison.output
-    clock = _Clock(output / SECONDS)
+    clock = _Clock(output / SECONDS, (output / RESULTS).is_file())
     if stages.synthesis is not None:
         with clock.stage("synthesize"), told(console, "Synthesize"):
             synthesize_drive(stages.synthesis)
@@ -208,10 +208,10 @@ def _page(page: Report, options: DemoOptions, results: dict[str, Any]) -> Report
 
 
 class _Clock:
-    """Seconds of each stage, kept in a file, so that those of an interrupted call count, too."""
+    """Seconds of each stage, kept in a file, so that those of an interrupted call count, too; a finished one's stay."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, is_finished: bool) -> None:
+        self.path, self.is_finished = path, is_finished
         self.seconds: dict[str, float] = read_json(path) if path.is_file() else {}
 
     @contextmanager
@@ -220,5 +220,6 @@ class _Clock:
         try:
             yield
         finally:
-            self.seconds[name] = round(self.seconds.get(name, 0.0) + time.monotonic() - started, 1)
-            write_json(self.path, self.seconds)
+            if not self.is_finished:
+                self.seconds[name] = round(self.seconds.get(name, 0.0) + time.monotonic() - started, 1)
+                write_json(self.path, self.seconds)
