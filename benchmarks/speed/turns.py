@@ -236,13 +236,15 @@ def race(
         contestant.wait()
     for contestant in contestants.values():  # kernels are compiled, memory is there
         contestant.ask("iterate", range(WARM_UPS if torch.cuda.is_available() else 3))
+    order = list(contestants.values())
     for number in range(rounds):
         chosen = spread[number * steps : (number + 1) * steps]
-        for contestant in contestants.values():
+        for contestant in order:
             contestant.step_s.append(contestant.ask("iterate", chosen) / steps)
-        for contestant in contestants.values() if view_rays else ():
+        for contestant in order if view_rays else ():
             taken, contestant.rendered_px = contestant.ask("render", view_rays)
             contestant.render_s.append(taken)
+        order.reverse()  # whose turn follows that of a larger one is slower: equal code by a tenth
         CONSOLE.print(f"Round {number + 1} of {rounds}")
     graphs = {name: contestant.ask("graphs", None) for name, contestant in contestants.items()}
     for contestant in contestants.values():
