@@ -1,4 +1,5 @@
 import inspect
+import re
 import subprocess
 import sys
 from copy import deepcopy
@@ -9,7 +10,8 @@ from typing import Any
 
 import pytest
 import torch
-from nerfstudio.configs.method_configs import all_methods
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.plugins.types import MethodSpecification
 
 from edge_depth_nerf.base.errors import InputError
@@ -195,6 +197,22 @@ def test_users_of_other_methods_are_left_alone():
     """Every ns-* command loads the entry points; hooks, settings and others' classes stay the same."""
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", UNCHANGED], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_options_that_pages_and_messages_name_can_be_typed(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    options = r"--(?:pipeline|optimizers|machine|viewer)\.[a-z0-9.-]*[a-z0-9]|fisheye-depth-data[\s\"]+--[a-z-]+"
+    files = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "edge_depth_nerf").rglob("*.py")]
+    named = {re.sub(r"[\s\"]+", " ", name) for file in files for name in re.findall(options, file.read_text("utf-8"))}
+    named -= {"--pipeline.model.losses.ratio.delta", "--pipeline.model"}  # of the page's example; with its name behind
+    typed = set()
+    for of_scene in ([], ["fisheye-depth-data"]):
+        with pytest.raises(SystemExit):
+            tyro.cli(AnnotatedBaseConfigUnion, args=["edge-depth-nerf-lite", *of_scene, "--help"])
+        helped = re.findall(r"--[a-zA-Z0-9.-]+", capsys.readouterr().out)
+        typed |= {" ".join((*of_scene, name)) for name in helped}
+    assert len(named) > 25
+    assert sorted(named - typed) == []
 
 
 @pytest.mark.parametrize(

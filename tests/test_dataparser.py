@@ -247,7 +247,7 @@ def test_another_size_is_named(tmp_path, what):
         (lambda meta: meta["frames"][5].pop("fl_x"), "0005.png: fl_x is None, expected a number"),
         (lambda meta: meta["test_filenames"].append("images/x.png"), "test_filenames names images/x.png"),
         (lambda meta: [frame.update(frame=3) for frame in meta["frames"]], "frame 3 is in train_.* and in val_"),
-        (lambda meta: meta.update(train_filenames=[]), "no picture is left for the split 'train'"),
+        (lambda meta: meta.update(train_filenames=[]), "names no pictures in train_filenames. Give all of"),
         (lambda meta: meta["frames"][1].pop("mono_file_path"), "mono_file_path is given for 8 of 9.*0001.png"),
     ],
 )

@@ -200,8 +200,8 @@ def test_a_null_is_no_number(tmp_path, change, message):
 def test_a_split_that_is_not_listed(tmp_path):
     with transforms(scene := write_scene(tmp_path, frames=2)) as meta:
         del meta["val_filenames"]
-    with pytest.raises(InputError, match="but no val_filenames"):
-        FisheyeDepthDataParserConfig(data=scene).setup().get_dataparser_outputs("val")
+    with pytest.raises(InputError, match="names no pictures in val_filenames"):
+        FisheyeDepthDataParserConfig(data=scene).setup().get_dataparser_outputs("train")
 
 
 # ---- paths -----------------------------------------------------------------------------------------------------

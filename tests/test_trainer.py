@@ -7,6 +7,7 @@ import io
 import os
 import re
 import shlex
+import shutil
 import signal
 from copy import deepcopy
 from pathlib import Path
@@ -117,6 +118,39 @@ def test_lambda_falls_over_the_whole_training_also_of_one_taken_up_again(trained
     assert model.weights_now()[0] == pytest.approx(whole.config.depth_loss_mult * share)
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"model__exposure": "none"}, r"optimisers do not fit .* exposure, camera-optimizer\.mode"),
+        ({"model__exposure": "embedding"}, r"field\.mlp_head.* have other sizes than here\. Load it with the options"),
+        ({"model__max_res": 1024}, r"was made with .* grids of 16, 2048, .* cells; here are .* grids of 16, 1024, "),
+        ({"parser__metres_per_unit": 20.0}, r"made with 10 m a unit, .*; here are 20 m a unit"),
+        ({"parser__center_method": "none"}, r"the origin at .*; here are .*, the origin at -?0, -?0, -?0 m"),
+    ],
+)
+def test_a_training_is_resumed_with_its_own_options(trained, tmp_path, changes, said):
+    with pytest.raises(InputError, match=f"^The checkpoint(?:'s)? .*{said}"):
+        trainer_of(trained[0].config.data, tmp_path, load_dir=trained[0].checkpoint_dir, **changes)
+
+
+def test_a_training_is_not_taken_to_fewer_pictures(trained, tmp_path):
+    scene = shutil.copytree(trained[0].config.data, tmp_path / "scene")
+    with transforms(scene) as meta:
+        meta["train_filenames"].pop()
+    with pytest.raises(InputError, match=r"exposure\.log_gains have other sizes than here"):
+        trainer_of(scene, tmp_path, load_dir=trained[0].checkpoint_dir)
+
+
+def test_a_checkpoint_without_scale_is_loaded(trained, tmp_path):
+    """Those of earlier versions have none."""
+    newest = newest_checkpoint(trained[0].checkpoint_dir)
+    assert newest is not None
+    saved = torch.load(newest)
+    assert saved["pipeline"].pop("made_with")[3] == 10
+    torch.save(saved, tmp_path / newest.name)
+    trainer_of(trained[0].config.data, tmp_path / "runs", load_dir=tmp_path, model__max_res=1024)
+
+
 def test_in_a_step_torch_has_one_thread_and_the_kernels_have_all(trainer, monkeypatch):
     before = torch.get_num_threads()
     torch.set_num_threads(3)
@@ -206,6 +240,7 @@ def test_a_relative_scene_is_said_to_be_relative(trainer, tmp_path, monkeypatch)
         ("pipeline.model.near_plane", 1.0, "--pipeline.model.near-plane has no effect: use --pipeline.model.near-m"),
         ("pipeline.datamanager.pixel_sampler.ignore_mask", True, "pixel-sampler.ignore-mask has no effect: leave it"),
         ("pipeline.datamanager.patch_size", 4, "--pipeline.datamanager.patch-size has no effect: leave it out"),
+        ("pipeline.datamanager.dataparser.mask_color", (0, 0, 0), "fisheye-depth-data --mask-color has no effect"),
         ("pipeline.model.background_color", "white", "leave it out, or add --pipeline.model.depth-loss none"),
     ],
 )

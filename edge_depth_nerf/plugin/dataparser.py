@@ -63,7 +63,7 @@ class FisheyeDepthDataParserConfig(NerfstudioDataParserConfig, SceneOptions):
 
     _target: type = field(default_factory=lambda: FisheyeDepth)
     """Target class to instantiate."""
-    depth_unit_scale_factor: tyro.conf.Suppress[float | None] = None  # pyrefly: ignore
+    depth_unit_scale_factor: float | None = None  # pyrefly: ignore
     """Metres per count of the files under depth_file_path. Not set: what transforms.json says, else nerfstudio's
     0.001."""
     downscale_factor: tyro.conf.Suppress[int | None] = 1
@@ -176,7 +176,7 @@ class FisheyeDepth(Nerfstudio):
                 f"for {', '.join(missing[:3])}{' …' if len(missing) > 3 else ''}. Give it for every frame or none."
             )
         check_split(meta, path)
-        self._check_config(meta, path, split)
+        self._check_config(meta, path)
         metres_per_unit = self._metres_per_unit(frames)
         # nerfstudio's parser takes the scale from its config; the user's own stays
         self.config = replace(self.config, scale_factor=1.0 / metres_per_unit)
@@ -207,11 +207,15 @@ class FisheyeDepth(Nerfstudio):
                 raise FileNotFoundError(f"{file}: no such file, but {path} names it. Process the drive again.")
         return outputs
 
-    def _check_config(self, meta: dict[str, Any], path: Path, split: str) -> None:
-        """Check what the options ask of the scene."""
-        named = [f"{name}_filenames" for name in ("train", "val", "test") if f"{name}_filenames" in meta]
-        if named and f"{split}_filenames" not in named:
-            raise InputError(f"{path}: has {' and '.join(named)}, but no {split}_filenames. Give all three, or none.")
+    def _check_config(self, meta: dict[str, Any], path: Path) -> None:
+        """Check what the options, and the commands after a training, ask of the scene."""
+        lists = [f"{name}_filenames" for name in ("train", "val", "test")]
+        lacking = [name for name in lists if not meta.get(name)]
+        if lacking and any(name in meta for name in lists):
+            raise InputError(
+                f"{path}: names no pictures in {' and '.join(lacking)}. Give all of {', '.join(lists)}, or none; "
+                "val and test may have the same."
+            )
         if self.config.downscale_factor != 1:
             raise InputError(
                 f"{path}: downscale_factor is {self.config.downscale_factor}, but pictures and maps are used in the "

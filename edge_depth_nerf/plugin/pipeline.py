@@ -39,6 +39,16 @@ MOST_NOT_FINITE = 5
 """So many of them may be: the scaler of mixed precision skips such a step. NaN in a parameter stays, and makes more."""
 MOST_NAMED = 5
 """An error names so many pictures."""
+SAME_M = 0.05
+"""Scale and origin of a scene that differ by no more are the same."""
+_FITS = (
+    "Load it with the options of its training (config.yml beside its folder has them) and its unchanged scene, or "
+    "train again."
+)
+
+
+def _written(numbers: torch.Tensor) -> str:
+    return ", ".join(f"{number:.6g}" for number in numbers.tolist())
 
 
 def _has_depth(data: FisheyeDepthDataManagerConfig) -> bool:
@@ -108,7 +118,7 @@ class EdgeDepthPipeline(VanillaPipeline):
                 f"{manager.get_datapath()}: the far plane of {model.far_m:g} m is at "
                 f"{model.far_m / metres_per_unit:.3g} scene units ({metres_per_unit:.3g} m each); beyond "
                 f"{FARTHEST_UNITS:g} float32 cannot distinguish the samples along a ray. Lower "
-                "--pipeline.model.far-m, or leave --pipeline.datamanager.dataparser.metres-per-unit at its default."
+                "--pipeline.model.far-m, or leave fisheye-depth-data --metres-per-unit at its default."
             )
         sampler = manager.train_pixel_sampler
         if model.depth_loss != "none" and sampler is not None and sampler.table.share_with_prior == 0:
@@ -132,12 +142,17 @@ class EdgeDepthPipeline(VanillaPipeline):
         self.model.register_load_state_dict_post_hook(lambda *_: self.detail.forget())
         self.layers = DriveLayers(manager, model.detail)
         self._odd_steps = torch.zeros((), dtype=torch.long, device=device)
+        # what a checkpoint's numbers mean nothing without, and what has no size: origin, scale, and cells of the grids
+        shift_m = manager.train_dataparser_outputs.dataparser_transform[:, 3].tolist()
+        grids = [model.base_res, model.max_res, *(each["max_res"] for each in model.proposal_net_args_list)]
+        self.register_buffer("made_with", torch.tensor([*shift_m, metres_per_unit, *grids], dtype=torch.float64))
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint as nerfstudio does.
 
         Raises:
-            InputError: it is of tiny-cuda-nn; nerfstudio would load what fits, and say nothing of the rest.
+            InputError: it is of tiny-cuda-nn, other options or another scene; nerfstudio would load what fits, and say
+                nothing of the rest.
         """
         # tiny-cuda-nn keeps table and network in one parameter
         if not any(key.endswith(".hash_table") for key in loaded_state):
@@ -145,6 +160,18 @@ class EdgeDepthPipeline(VanillaPipeline):
                 "This checkpoint has no hash tables: it was made with tiny-cuda-nn, which keeps them in another form. "
                 "Train again; the fused kernels need no tiny-cuda-nn and are faster."
             )
+        here, own = self.model.state_dict(), self.made_with.cpu()
+        given = {name.replace("module.", "").removeprefix("_model."): value for name, value in loaded_state.items()}
+        odd = [name for name, value in given.items() if name in here and here[name].shape != value.shape]
+        if odd:
+            raise InputError(f"The checkpoint's {', '.join(odd[:3])} have other sizes than here. {_FITS}")
+        made_with = given.get("made_with", own).cpu()  # those of before have none
+        if len(made_with) != len(own) or not torch.allclose(made_with, own, rtol=0, atol=SAME_M):
+            found, expected = (
+                f"{each[3]:.4g} m a unit, the origin at {_written(-each[:3])} m, grids of {_written(each[4:])} cells"
+                for each in (made_with, own)
+            )
+            raise InputError(f"The checkpoint was made with {found}; here are {expected}. {_FITS}")
         super().load_pipeline(loaded_state, step)
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Any], dict[str, Any]]:

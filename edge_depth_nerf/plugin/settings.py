@@ -17,10 +17,11 @@ WITHOUT_EFFECT = {
     "pipeline.model.use_appearance_embedding": "use --pipeline.model.exposure embedding",
     "pipeline.model.camera_optimizer.trans_l2_penalty": "use --pipeline.model.camera-optimizer.sigma-m",
     "pipeline.model.camera_optimizer.rot_l2_penalty": "use --pipeline.model.camera-optimizer.sigma-deg",
-    "pipeline.datamanager.dataparser.scale_factor": "use --pipeline.datamanager.dataparser.metres-per-unit",
+    "pipeline.datamanager.dataparser.scale_factor": "use fisheye-depth-data --metres-per-unit",
     **dict.fromkeys(
         (
             *(f"pipeline.model.{name}" for name in ("enable_collider", "collider_params", "loss_coefficients")),
+            *(f"pipeline.datamanager.dataparser.{name}" for name in ("mask_color", "load_3D_points")),
             *(f"pipeline.datamanager.{name}_on_gpu" for name in ("images", "masks")),
             *(f"pipeline.datamanager.{split}_num_images_to_sample_from" for split in ("train", "eval")),
             *(f"pipeline.datamanager.{split}_num_times_to_repeat_images" for split in ("train", "eval")),
@@ -58,11 +59,17 @@ def changed_settings(config: Any, usual: Any) -> dict[str, Any]:
     }
 
 
+def as_typed(name: str) -> str:
+    """Write a setting's dotted name as the option of `ns-train` that sets it."""
+    _, of_scene, last = name.rpartition("pipeline.datamanager.dataparser.")
+    return f"{'fisheye-depth-data ' if of_scene else ''}--{last.replace('_', '-')}"
+
+
 def check_effect(changed: Iterable[str], has_sky: bool) -> None:
     """Raise an InputError if some of the changed settings have no effect."""
     without_effect = WITHOUT_EFFECT | (WITHOUT_EFFECT_BESIDE_SKY if has_sky else {})
     found = [
-        f"--{name.replace('_', '-')} has no effect: {instead}"
+        f"{as_typed(name)} has no effect: {instead}"
         for name in changed
         for option, instead in without_effect.items()
         if name == option or name.startswith(f"{option}.")

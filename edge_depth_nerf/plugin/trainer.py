@@ -38,7 +38,7 @@ from edge_depth_nerf.plugin.grad_scaler import PatientGradScaler
 from edge_depth_nerf.plugin.model import ModelOptions
 from edge_depth_nerf.plugin.pipeline import EdgeDepthPipeline, NotFiniteError
 from edge_depth_nerf.plugin.plain_errors import say_errors_plainly
-from edge_depth_nerf.plugin.settings import changed_settings, check_effect
+from edge_depth_nerf.plugin.settings import as_typed, changed_settings, check_effect
 from edge_depth_nerf.plugin.step_graphs import Capture, GpuCapture, StepGraphs, why_not
 
 TOLD_EVERY_S, TOLD_EVERY_SHARE = 10.0, 0.05
@@ -76,7 +76,7 @@ class EdgeDepthTrainerConfig(TrainerConfig, TrainingOptions):
         scene = self.pipeline.datamanager.data
         lines = [f"{self.method_name}: {self.max_num_iterations} steps on {self.machine.device_type}, scene {scene}"]
         for name, value in self._changed().items():
-            lines.append(f"  --{name.replace('_', '-')} {value.__qualname__ if isinstance(value, type) else value}")
+            lines.append(f"  {as_typed(name)} {value.__qualname__ if isinstance(value, type) else value}")
         say(CONSOLE, "\n".join(lines))
 
     def save_config(self) -> None:
@@ -284,11 +284,11 @@ class EdgeDepthTrainer(Trainer):
         """Load a checkpoint as nerfstudio does: the newest complete one of `load_dir`.
 
         Raises:
-            InputError: there is none.
+            InputError: there is none, or it is of other options.
         """
         folder = self.config.load_dir
         if folder is None or self.config.load_step is not None:
-            super()._load_checkpoint()
+            self._load_fitting()
             return
         newest = newest_checkpoint(folder)
         every = checkpoints_in(folder)
@@ -303,9 +303,20 @@ class EdgeDepthTrainer(Trainer):
         given = self.config
         self.config = dataclasses.replace(given, load_step=int(newest.stem.removeprefix("step-")))
         try:
-            super()._load_checkpoint()
+            self._load_fitting()
         finally:
             self.config = given
+
+    def _load_fitting(self) -> None:
+        try:
+            super()._load_checkpoint()
+        except InputError:
+            raise
+        except (KeyError, ValueError) as error:  # of its optimisers, whose parameters torch does not name
+            raise InputError(
+                f"The checkpoint's optimisers do not fit ({error}). exposure, camera-optimizer.mode, predict-normals "
+                "and optimizers must be those of the training that is resumed: repeat its options. config.yml has them."
+            ) from error
 
     def _kept(self) -> str:
         """Return a sentence on how to resume."""
