@@ -40,6 +40,7 @@ def folder(tmp_path) -> Path:
     shown = np.where(FOUND.within[..., None], np.rint(127.5 + 127.5 * FOUND.directions), 0).astype(np.uint8)
     for name in ("a", "b"):
         write_png(tmp_path / "pictures" / f"{name}.png", shown)
+    (tmp_path / "pictures" / "._a.png").write_bytes(b"of macOS")
     keys = {"model": "opencv_fisheye", "cx": LENS.cx - 0.5, "cy": LENS.cy - 0.5}
     keys |= {key: getattr(LENS, key) for key in ("width", "height", "fx", "fy", "k1", "k2", "k3", "k4")}
     (tmp_path / "lens.toml").write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in keys.items()))

@@ -265,6 +265,14 @@ def test_what_moves_in_a_drive_is_masked_and_masks_can_be_corrected(
     assert not read_mask(tmp_path / "scene/masks" / name)[60:70, 60:70].any()
     assert all("mask_path" in frame for frame in frames)
 
+    # a sweep that was repaired: what was found is found again, what was corrected stays
+    masks = sorted((tmp_path / "scene" / MOVING_MASKS).rglob("*.png"))
+    before = {path: path.stat().st_mtime_ns for path in masks}
+    recording.sweeps[3].path.touch()
+    found_again(recording, options(drive, tmp_path / "scene"))
+    stayed = [path for path in masks if path.stat().st_mtime_ns == before[path]]
+    assert stayed == [tmp_path / "scene" / MOVING_MASKS / name] and len(masks) > 20
+
 
 @pytest.mark.slow
 def test_training_pictures_know_nothing_of_sweeps_that_are_held_out(

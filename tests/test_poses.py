@@ -63,6 +63,7 @@ def test_nerfstudio_turns_the_cameras_axes(tmp_path: Path) -> None:
 def test_times(tmp_path: Path) -> None:
     assert read_times(text(tmp_path, "1.5\n2.25 # later\n")) == [(None, 1.5), (None, 2.25)]
     assert read_times(text(tmp_path, "a.png, 3\nb.png 4\n")) == [("a.png", 3.0), ("b.png", 4.0)]
+    assert read_times(text(tmp_path, "time,file\n3,Bild 1.jpg\n4, b.jpg\n")) == [("Bild 1.jpg", 3.0), ("b.jpg", 4.0)]
 
 
 @pytest.mark.parametrize(

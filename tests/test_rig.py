@@ -639,7 +639,8 @@ def test_jpegs_and_patterns(mine: Path) -> None:
 
     for path in sorted((mine / "images/front").iterdir()):
         cv2.imwrite(str(mine / f"front_{int(path.stem)}.jpg"), read_image(path)[..., ::-1])
-    edit(mine, ('images = "images/front"', 'images = "front_*.jpg"'), ('mono = "mono/front"\n', ""))
+    edit(mine, ('images = "images/front"', 'images = "*front_*.jpg"'), ('mono = "mono/front"\n', ""))
+    (mine / "._front_0.jpg").write_bytes(b"of macOS")
     recording = read(mine, cameras=("front",))
     assert [picture.path.name for picture in recording.pictures] == [f"front_{number}.jpg" for number in range(FRAMES)]
     (mine / "front_3.jpg").write_bytes(b"\xff\xd8\xff")

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from drives import SEQUENCE
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
@@ -37,7 +38,7 @@ from edge_depth_nerf.process.feature_masks import FeatureMasks
 from edge_depth_nerf.process.found_path import upright
 from edge_depth_nerf.process.lidar_checks import LidarCheck, check_lidar
 from edge_depth_nerf.process.mask_checks import mask_warnings
-from edge_depth_nerf.process.options import RigOptions
+from edge_depth_nerf.process.options import Kitti360Options, RigOptions
 from edge_depth_nerf.process.path_checks import path_warnings
 from edge_depth_nerf.process.readings import Reading, _axes
 from edge_depth_nerf.process.recording import DepthFile, Recording
@@ -408,6 +409,35 @@ def test_a_cut_jpeg_is_left_out_and_named(mine: Path, monkeypatch: pytest.Monkey
     assert not (report.scene / "images/front/0000000002.png").exists()
     with pytest.raises(InputError, match=r"000002\.jpg: cannot be decoded"):
         run(mine, output=mine.parent / "strict", strict=True, downscale=2, cameras=("front",))
+
+
+# ---- when it is checked ------------------------------------------------------------------------------------------
+def test_the_vehicle_is_masked_before_lidar_is_held_against_pictures(tmp_path: Path) -> None:
+    synthesize_drive(SynthesizeOptions(tmp_path / "drive", "turn", frames=12, size=160))
+    options = Kitti360Options(
+        root=tmp_path / "drive", output=tmp_path / "scene", sequence=SEQUENCE, strict=True, motion=False
+    )
+    report = convert(replace(options, estimate_depth=False, refine_poses=False), Console(quiet=True))
+    assert report.warnings == () and (report.scene / "ego_masks/image_02.png").is_file()
+
+
+def test_lidar_is_checked_again_if_files_are_newer(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    says = LidarCheck((), ("LiDAR is turned.",))
+    monkeypatch.setattr(build, "check_lidar", lambda *_: says)
+    cameras = ("right",)
+    edit(mine, lambda text: re.sub(r"(?m)^ego_mask.*\n", "", text))
+    with pytest.raises(InputError, match=r"^LiDAR is turned\. Without --strict"):
+        run(mine, strict=True, cameras=cameras)
+    # nothing is left of it that would bind the corrected drive
+    report, said = run(mine, cameras=cameras, downscale=2)
+    assert report.warnings == says.warnings and said.count("LiDAR is turned.") == 2
+    says = LidarCheck((), ())
+    assert run(mine, cameras=cameras, downscale=2)[0].warnings == ("LiDAR is turned.",)
+    with pytest.raises(InputError, match=r"^LiDAR is turned\. Without --strict"):
+        run(mine, strict=True, cameras=cameras, downscale=2)
+    next((mine / "lidar").iterdir()).touch()
+    assert run(mine, cameras=cameras, downscale=2)[0].warnings == ()
+    assert read_json(report.scene / "checks.json")["warnings"] == []
 
 
 # ---- what is wrong with a recording ------------------------------------------------------------------------------

@@ -144,6 +144,14 @@ def sha256_of(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def is_newer(path: Path, sources: Iterable[Path]) -> bool:
+    """Whether a file is there, and none of its sources changed since; sources that are not there count as unchanged."""
+    if not path.is_file():
+        return False
+    written_ns = path.stat().st_mtime_ns
+    return all(source.stat().st_mtime_ns <= written_ns for source in sources if source.exists())
+
+
 def write_text(path: Path, content: str) -> None:
     """Write UTF-8 text atomically."""
     write_bytes(path, content.encode())

@@ -22,6 +22,7 @@ from edge_depth_nerf.base.errors import InputError, require
 from edge_depth_nerf.base.files import (
     IMAGE_SUFFIXES,
     as_people_count,
+    is_newer,
     open_folder,
     read_image,
     read_mask,
@@ -148,7 +149,7 @@ def open_fisheyes(options: FisheyeDepthOptions) -> Fisheyes:
     if not options.pictures.is_dir():
         raise FileNotFoundError(f"{options.pictures}: no such folder. Give the folder of one camera's pictures.")
     listed = [path for path in options.pictures.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
-    pictures = sorted(listed, key=as_people_count)
+    pictures = sorted((path for path in listed if not path.name.startswith(".")), key=as_people_count)
     if not pictures:
         raise InputError(f"{options.pictures}: has no picture; expected files that end in {', '.join(IMAGE_SUFFIXES)}.")
     names = [path.stem for path in pictures]
@@ -186,15 +187,11 @@ def _record(options: FisheyeDepthOptions, fisheyes: Fisheyes) -> dict[str, Any]:
 
 def _cut(picture: Path, output: Path, fisheyes: Fisheyes) -> None:
     paths = [output / VIEWS / f"{picture.stem}_{number}.png" for number in range(len(fisheyes.views))]
-    if all(_is_newer(path, [picture]) for path in paths):
+    if all(is_newer(path, [picture]) for path in paths):
         return
     rgb = read_image(picture)
     for path, view in zip(paths, fisheyes.views, strict=True):
         write_png(path, view.cut(rgb))
-
-
-def _is_newer(path: Path, sources: Sequence[Path]) -> bool:
-    return path.is_file() and all(path.stat().st_mtime_ns >= source.stat().st_mtime_ns for source in sources)
 
 
 def _maps_of(folder: Path, picture: Path, views: Sequence[PinholeView]) -> list[Path]:
@@ -216,7 +213,7 @@ def _make(
     suffix = ".png" if kind == "metric" else ".npy"
     targets = {path: output / DISTANCE / f"{path.stem}{suffix}" for path in sources}
     masks = [] if fisheyes.mask_file is None else [fisheyes.mask_file]
-    missing = [path for path, target in targets.items() if not _is_newer(target, [path, *sources[path], *masks])]
+    missing = [path for path, target in targets.items() if not is_newer(target, [path, *sources[path], *masks])]
     usable = fisheyes.usable() if missing else np.empty((0, 0), bool)
     with progress_bars(console, counted=True) as progress:
         for path in progress.track(missing, description="Distance maps"):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import shutil
 import threading
 from collections import defaultdict
 from collections.abc import Collection, Sequence
@@ -24,11 +25,12 @@ from torch import Tensor
 
 from edge_depth_nerf.base.console import say
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_distance_png, read_image, read_json, write_json
+from edge_depth_nerf.base.files import is_newer, read_distance_png, read_image, read_json, write_json
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import project_points, transform_points
+from edge_depth_nerf.masks.ego_files import EGO_MASKS
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.process.found_path import with_all_cameras
@@ -94,24 +96,31 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
     with console.status("Checking cameras and files …"):
         source = _source(recording, options)
         check_cameras(_scene_cameras(recording, vehicle_masks(recording), options), options.theta_max_deg)
-    # poses that come with the drive are checked before anything long
-    checked = _checked(recording, options, console) if options.poses == "recorded" else None
     open_scene(options.output, source)
     if options.poses == "lidar":
         from edge_depth_nerf.process.lidar_poses import lidar_poses
 
         recording = lidar_poses(recording, options, console)
     notices: list[str] = []
+    masked_before = (options.output / EGO_MASKS).exists()
     if options.find_ego:
         held_out = _held_out(recording, options)
         # a camera that is held out needs a mask, too, which no other camera's pictures depend on
         training = [picture for picture in recording.pictures if picture.frame not in held_out]
         recording, notices = find_vehicle(recording, training, options, console)
+    checked = None
+    if options.poses == "recorded":
+        # poses that come with the drive are checked before anything long; the vehicle, unmasked, looks like an error
+        try:
+            checked = _checked(recording, options, console)
+        except InputError:
+            if not masked_before:
+                # what is corrected begins anew
+                shutil.rmtree(options.output / EGO_MASKS, ignore_errors=True)
+            raise
     recording, said = _posed(recording, options, console)
     notices += said
     checked = checked or _checked(recording, options, console)
-    if checked.figures or not (options.output / CHECKS).is_file():
-        write_json(options.output / CHECKS, dataclasses.asdict(checked))
     if recording.skipped:
         say(console, f"Left out: {summarise(recording.skipped)}", "yellow")
     held_out, masks = _held_out(recording, options), vehicle_masks(recording)
@@ -190,14 +199,29 @@ def _never_held_out(recording: Recording, held_out: Collection[int], holdout_eve
 
 
 def _checked(recording: Recording, options: ProcessOptions, console: Console) -> LidarCheck:
-    """Hold LiDAR, the pictures, the path and the masks against each other. A complete scene was checked before.
+    """Hold LiDAR, the pictures, the path and the masks against each other, and keep what is found.
+
+    A complete scene was checked before, unless files are newer.
 
     Raises:
         InputError: under `strict`, something seems to be wrong.
     """
-    if (options.output / TRANSFORMS).is_file() and (options.output / CHECKS).is_file():
-        kept = read_json(options.output / CHECKS)
-        return LidarCheck((), tuple(kept["warnings"]))
+    path = options.output / CHECKS
+    made_of = [*(file for one in recording.pictures for file in one.inputs), *(one.path for one in recording.sweeps)]
+    made_of += [camera.ego_mask for camera in recording.cameras if camera.ego_mask is not None]
+    kept = (options.output / TRANSFORMS).is_file() and is_newer(path, made_of)
+    found = LidarCheck((), tuple(read_json(path)["warnings"])) if kept else _compared(recording, options, console)
+    if options.strict and found.warnings:
+        raise InputError(" ".join(found.warnings) + " Without --strict this is a warning.")
+    if not kept:
+        write_json(path, dataclasses.asdict(found))
+        # they are repeated at the end; whoever sees them now may stop
+        for warning in found.warnings:
+            say(console, warning, "yellow")
+    return found
+
+
+def _compared(recording: Recording, options: ProcessOptions, console: Console) -> LidarCheck:
     if recording.trajectory is None:
         raise InputError("the recording has no poses. Give them, or compute them: --poses lidar, --poses colmap.")
     masks = vehicle_masks(recording)
@@ -210,13 +234,7 @@ def _checked(recording: Recording, options: ProcessOptions, console: Console) ->
         of_path, lost = path_warnings(recording, usable) if options.poses == "recorded" else ([], False)
         # where lengths or masks are wrong, LiDAR seems to be, too
         found = LidarCheck((), ()) if lost or of_masks else check_lidar(recording, usable)
-        found = dataclasses.replace(found, warnings=(*of_path, *of_masks, *found.warnings))
-    if options.strict and found.warnings:
-        raise InputError(" ".join(found.warnings) + " Without --strict this is a warning.")
-    # they are repeated at the end; whoever sees them now may stop
-    for warning in found.warnings:
-        say(console, warning, "yellow")
-    return found
+        return dataclasses.replace(found, warnings=(*of_path, *of_masks, *found.warnings))
 
 
 def _check_poses(recording: Recording, options: ProcessOptions) -> None:

@@ -1,8 +1,8 @@
 """Masks of what moves, found by LiDAR: `moving_masks/CAMERA/0000000123.png` in the scene, 255 = use the pixel.
 
-They have the size of the raw pictures, so that the folder can be given as --frame-masks. An existing mask stays
-unchanged: it may have been corrected. Masks of training pictures use nothing from the sweeps of held-out frames. A
-held-out picture gets a mask from its own sweep: it decides which pixels are evaluated.
+They have the size of the raw pictures, so that the folder can be given as --frame-masks. A mask that was corrected
+stays unchanged; others are made again if a sweep is newer. Masks of training pictures use nothing from the sweeps of
+held-out frames. A held-out picture gets a mask from its own sweep: it decides which pixels are evaluated.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.console import run_jobs
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import read_image, read_mask, write_mask
+from edge_depth_nerf.base.files import is_newer, read_image, read_json, read_mask, sha256_of, write_json, write_mask
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.lidar import project_points, transform_points
 from edge_depth_nerf.lidar.free_space import FreeSpace
@@ -47,6 +47,8 @@ from edge_depth_nerf.process.sweep_store import Scanner, SweepStore, elevation_r
 
 MOVING_MASKS = "moving_masks"
 """Folder of the scene with the masks of what moves."""
+_FOUND = ".cache/moving_masks.json"
+"""SHA-256 of each mask when it was found: one that has another was corrected."""
 
 _FOOT_M = (0.06, 0.3)
 """LiDAR points between these heights above the ground are left out of the search for things; they are feet and
@@ -76,7 +78,7 @@ def find_moving(
     ego: Mapping[str, NDArray[np.bool_]],
     console: Console,
 ) -> tuple[Recording, list[str]]:
-    """Find what moves, write the masks that are not there yet, and give them to the recording's pictures.
+    """Find what moves, write the masks that are missing or out of date, and give them to the recording's pictures.
 
     The recording has a trajectory. `held_out` are numbers of the frames that training must not see, `ego` the vehicle's
     masks by camera, in the size of the raw pictures.
@@ -93,12 +95,21 @@ def find_moving(
             "--frame-masks."
         )
     paths = [moving_mask_path(options.output, picture) for picture in recording.pictures]
-    missing = [each for each in zip(paths, recording.pictures, strict=True) if not each[0].is_file()]
+    kept_at, sweeps = options.output / _FOUND, [sweep.path for sweep in recording.sweeps]
+    kept: dict[str, str] = read_json(kept_at) if kept_at.is_file() else {}
+
+    def stays(path: Path) -> bool:
+        return path.is_file() and (is_newer(path, sweeps) or kept.get(_key(path)) != sha256_of(path))
+
+    missing = [each for each in zip(paths, recording.pictures, strict=True) if not stays(each[0])]
     if missing:
         store = SweepStore(recording, options, held_out)
         found = [_ScannersThings(scanner, held_out, console) for scanner in store.scanners]
         jobs = [partial(_write_mask, path, recording, picture, found, ego, options) for path, picture in missing]
-        run_jobs(jobs, "Masking what moves", console)
+        try:
+            run_jobs(jobs, "Masking what moves", console)
+        finally:
+            write_json(kept_at, kept | {_key(path): sha256_of(path) for path, _ in missing if path.is_file()})
     made = [path if path.is_file() else None for path in paths]
     pictures = [replace(picture, moving_mask=mask) for picture, mask in zip(recording.pictures, made, strict=True)]
     shares = [1 - float(read_mask(path).mean()) for path in made if path is not None]
@@ -108,6 +119,10 @@ def find_moving(
         "the drive again."
     )
     return replace(recording, pictures=tuple(pictures)), [notice]
+
+
+def _key(mask: Path) -> str:
+    return f"{mask.parent.name}/{mask.name}"
 
 
 class _ScannersThings:

@@ -276,10 +276,17 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Lines with something in them, counted from 1, as words; what follows # and a first line of names are left out."""
     begun = False
     for number, line in text_lines(path):
-        if words := line.partition("#")[0].replace(",", " ").split():
+        fields = line.partition("#")[0].split(",")
+        if words := " ".join(fields).split():
             if begun or not all(_HEADING.fullmatch(word) and not _is_number(word) for word in words):
-                yield number, words
+                # a name between commas may have spaces
+                yield number, words if len(fields) == 1 else [word for field in fields for word in _words(field)]
             begun = True
+
+
+def _words(field: str) -> list[str]:
+    words = field.split()
+    return words if all(map(_is_number, words)) else [field.strip()]
 
 
 def _is_number(word: str) -> bool:

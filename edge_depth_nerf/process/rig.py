@@ -238,6 +238,8 @@ def _files(root: Path, given: str, suffixes: tuple[str, ...]) -> list[Path]:
         folder = root.joinpath(*parts[: wild[0]])
         try:
             found = [file for file in folder.glob(str(Path(*parts[wild[0] :]))) if file.is_file()]
+            # as a shell's *, which leaves out what macOS puts beside each file
+            found = [file for file in found if not file.name.startswith(".") or parts[-1].startswith(".")]
         except ValueError as error:
             raise InputError(f"{path}: is not a valid pattern of files ({error}); it is in the rig file.") from None
         what = "no file has such a name"
