@@ -24,6 +24,7 @@ from edge_depth_nerf.films.options import CameraPathOptions
 from edge_depth_nerf.films.paths import CameraPath, lane_shift, orbit, replay, up_of
 from edge_depth_nerf.plugin.config import edge_depth_nerf_lite
 from edge_depth_nerf.plugin.dataparser import FisheyeDepth, FisheyeDepthDataParserConfig
+from edge_depth_nerf.scene.reader import read_scene
 
 UP = np.array([0.0, 0.0, 1.0])
 RADIUS_M, SPEED_M_S = 20.0, 8.0
@@ -247,6 +248,17 @@ def film(scene: Path, tmp_path: Path, **options):
     write_camera_path(CameraPathOptions(config, output=output, **options), QUIET)
     path = read_json(output)
     return path, get_path_from_json(path)
+
+
+def test_a_pinhole_beside_fisheyes_is_filmed_as_a_pinhole(tmp_path):
+    """The scene has a fisheye in its place, as nerfstudio takes one kind of camera."""
+    scene = write_scene(tmp_path / "scene", [fisheye(32, 28)])
+    with transforms(scene) as meta:
+        lens = {"model": "PINHOLE", "width": 32, "height": 28, "fx": 16.0, "fy": 16.0, "cx": 16.0, "cy": 14.0}
+        meta["original_cameras"] = {read_scene(scene).pictures[0].camera: lens}
+    path, cameras = film(scene, tmp_path)
+    assert path["camera_type"] == "perspective" and (path["render_width"], path["render_height"]) == (32, 28)
+    assert angles_deg(cameras, (14, 0))[0] == pytest.approx(45.0)
 
 
 def angles_deg(cameras, *pixels: tuple[int, int]) -> list[float]:

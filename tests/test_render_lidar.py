@@ -476,11 +476,15 @@ def test_an_interrupted_run_goes_on(trained):
         render_lidar(RenderLidarOptions(trained, every=3, sensor="vlp-16"), QUIET)
 
 
-def test_scans_of_another_path_or_training_are_not_kept(trained, tmp_path):
+def test_scans_of_another_path_or_training_are_not_kept(trained, tmp_path, monkeypatch):
     path = tmp_path / "path.txt"
     options = RenderLidarOptions(trained, sensor="vlp-16", path=str(path))
     path.write_text("0 1000 3800 117 0 0 0 1\n0.1 1000.5 3800 117 0 0 0 1\n")
     before = (render_lidar(options, QUIET) / "0000000000.ply").read_bytes()
+    with monkeypatch.context() as patch:
+        patch.chdir(trained.parent)
+        # the same file from another folder
+        assert render_lidar(replace(options, load_config=Path(trained.name)), QUIET) == Path("scans")
     path.write_text("0 1000 3801 117 0 0 0 1\n0.1 1000.5 3801 117 0 0 0 1\n")
     with pytest.raises(InputError, match="holds other scans"):
         render_lidar(options, QUIET)

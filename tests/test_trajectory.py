@@ -37,6 +37,16 @@ def test_between_poses_the_motion_is_a_screw(turn_rad: float) -> None:
     np.testing.assert_allclose(turn @ np.swapaxes(turn, 1, 2), np.tile(np.eye(3), (8, 1, 1)), atol=1e-9)
 
 
+def test_times_may_be_a_column_of_a_table(recwarn: pytest.WarningsRecorder) -> None:
+    poses, times_s = random_poses(1), torch.tensor([10.4, 13.0])
+    torch.set_warn_always(True)
+    try:
+        found = Trajectory(np.column_stack((TIMES, TIMES))[:, 0], poses).to_world(torch.ones(2, 3), times_s)
+    finally:
+        torch.set_warn_always(False)
+    assert torch.equal(found, Trajectory(TIMES, poses).to_world(torch.ones(2, 3), times_s)) and not recwarn.list
+
+
 def test_given_poses_come_back_exactly() -> None:
     poses = random_poses(2)
     assert np.array_equal(Trajectory(TIMES, poses).at(TIMES), poses)

@@ -88,11 +88,12 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
     scene, to_model = placed(options, console)
 
     pictures = _followed(scene, options.follow)
-    shown = camera_of(options, pictures[0].lens)
+    own = own_lens(scene, pictures[0])
+    shown = camera_of(options, own)
     options = replace(options, camera=shown)
     options.check()
     drive = CameraPath(_times_s(pictures), poses_of(pictures), up_of(np.stack([p.rotation for p in scene.pictures])))
-    lens = film_lens(pictures[0].lens, options)
+    lens = film_lens(own, options)
     fps = options.fps or round(drive.frame_rate_hz, 3)
     frames = _frames(drive, options, fps)
     times_s = np.linspace(drive.times_s[0], drive.times_s[-1], frames)
@@ -133,6 +134,14 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
     command = ("ns-render", "camera-path", "--load-config", config, "--camera-path-filename", str(output))
     say(console, f"  {shlex.join((*command, '--output-path', str(output.with_suffix('.mp4'))))}")
     return output
+
+
+def own_lens(scene: SceneFolder, picture: ScenePicture) -> KannalaBrandt | Pinhole:
+    """A picture's lens; of a pinhole beside fisheyes, for which the scene has a stand-in, the pinhole."""
+    original = scene.recorded("original_cameras", picture.camera)
+    if original.get("model") != Pinhole.model:
+        return picture.lens
+    return Pinhole(**{name: original[name] for name in ("width", "height", "fx", "fy", "cx", "cy")})
 
 
 def film_lens(lens: KannalaBrandt | Pinhole, options: CameraPathOptions) -> FilmLens:

@@ -72,8 +72,8 @@ def render_lidar(options: RenderLidarOptions, console: Console | None = None) ->
     cast = (pattern.directions, pattern.offset_s, times_s, poses, np.array(pattern.reach_m))
     record = {
         "made_by": f"edge-depth-nerf {__version__}",
-        "scene": str(scene.path),
-        "load_config": str(options.load_config),
+        "scene": str(scene.path.resolve()),
+        "load_config": str(options.load_config.resolve()),
         "steps": steps_done(options.load_config.parent / CHECKPOINTS),
         **{name: getattr(options, name) for name in ("sensor", "path", "shift_m", "every", "form")},
         "scanner": None if scanner is None else scanner.name,

@@ -230,8 +230,8 @@ def camera_figures(scene: SceneFolder, name: str, measured: Sequence[PictureFigu
     """Return the figures of one camera as JSON: its lens, its fit, its maps."""
     pictures = scene.cameras()[name]
     lens = pictures[0].lens
-    fit = recorded(scene, "camera_fits", name)
-    original = recorded(scene, "original_cameras", name)
+    fit = scene.recorded("camera_fits", name)
+    original = scene.recorded("original_cameras", name)
     limits_deg = [math.degrees(lens.theta_max_rad), math.degrees(scene.theta_max_rad), fit.get("theta_max_deg", 180.0)]
     return {
         "pictures": len(pictures),
@@ -245,13 +245,6 @@ def camera_figures(scene: SceneFolder, name: str, measured: Sequence[PictureFigu
         "fit_max_px": fit.get("max_px"),
         **map_figures([figures for figures in measured if figures.picture.camera == name]),
     }
-
-
-def recorded(scene: SceneFolder, table: str, camera: str) -> dict[str, Any]:
-    """Return a camera's entry in a table of transforms.json; empty in scenes of other makers."""
-    found = scene.meta.get(table)
-    found = found.get(camera) if isinstance(found, dict) else None
-    return found if isinstance(found, dict) else {}
 
 
 def _rounded(value: SupportsFloat | None) -> float | None:

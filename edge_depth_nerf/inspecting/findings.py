@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge_depth_nerf.inspecting.figures import PictureFigures, Step, recorded, steps, usual_length_m
+from edge_depth_nerf.inspecting.figures import PictureFigures, Step, steps, usual_length_m
 from edge_depth_nerf.inspecting.pose_check import BAD_MEDIAN_PX, bad_steps, pose_figures
 from edge_depth_nerf.masks.ego_files import ego_mask_path, vehicles_unknown
 from edge_depth_nerf.poses.matches import EpipolarAgreement
@@ -218,7 +218,7 @@ def _timestamps(scene: SceneFolder) -> Iterator[Finding]:
 
 def _fits(scene: SceneFolder) -> Iterator[Finding]:
     for name in scene.cameras():
-        rms_px = recorded(scene, "camera_fits", name).get("rms_px")
+        rms_px = scene.recorded("camera_fits", name).get("rms_px")
         if isinstance(rms_px, (int, float)) and rms_px > LARGEST_FIT_RMS_PX:
             yield Finding(
                 "fit",

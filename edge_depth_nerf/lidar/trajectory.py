@@ -89,7 +89,7 @@ class Trajectory:
     ) -> Float[Tensor, "points 3"]:
         """Express points in the world, each by the vehicle's pose at its own time; float64."""
         times = times_s.to(torch.float64)
-        known = torch.from_numpy(self.times_s)
+        known = torch.from_numpy(np.ascontiguousarray(self.times_s))
         index = (torch.searchsorted(known, times, right=True) - 1).clamp(0, len(known) - 2)
         # how far along the interval, less than 0 or more than 1 beyond the ends
         along = ((times - known[index]) / (known[index + 1] - known[index]))[:, None]

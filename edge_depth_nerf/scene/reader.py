@@ -180,6 +180,12 @@ class SceneFolder:
         names = dict.fromkeys(picture.camera for picture in self.pictures)
         return {name: tuple(picture for picture in self.pictures if picture.camera == name) for name in names}
 
+    def recorded(self, table: str, camera: str) -> dict[str, Any]:
+        """Return a camera's entry in a table of transforms.json; empty in scenes of other makers."""
+        found = self.meta.get(table)
+        found = found.get(camera) if isinstance(found, dict) else None
+        return found if isinstance(found, dict) else {}
+
     def held_out_cameras(self) -> set[str]:
         """The cameras none of whose pictures is for training; other people's scenes have folders, not cameras."""
         every = self.cameras().items() if self.own and self.split_known else ()
