@@ -255,10 +255,11 @@ def test_a_pinhole_beside_fisheyes_is_filmed_as_a_pinhole(tmp_path):
     scene = write_scene(tmp_path / "scene", [fisheye(32, 28)])
     with transforms(scene) as meta:
         lens = {"model": "PINHOLE", "width": 32, "height": 28, "fx": 16.0, "fy": 16.0, "cx": 16.0, "cy": 14.0}
+        lens["theta_limit_rad"] = np.radians(40)
         meta["original_cameras"] = {read_scene(scene).pictures[0].camera: lens}
     path, cameras = film(scene, tmp_path)
     assert path["camera_type"] == "perspective" and (path["render_width"], path["render_height"]) == (32, 28)
-    assert angles_deg(cameras, (14, 0))[0] == pytest.approx(45.0)
+    assert angles_deg(cameras, (14, 0))[0] == pytest.approx(40.0)
 
 
 def angles_deg(cameras, *pixels: tuple[int, int]) -> list[float]:

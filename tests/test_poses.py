@@ -63,7 +63,7 @@ def test_nerfstudio_turns_the_cameras_axes(tmp_path: Path) -> None:
 def test_times(tmp_path: Path) -> None:
     assert read_times(text(tmp_path, "1.5\n2.25 # later\n")) == [(None, 1.5), (None, 2.25)]
     assert read_times(text(tmp_path, "a.png, 3\nb.png 4\n")) == [("a.png", 3.0), ("b.png", 4.0)]
-    assert read_times(text(tmp_path, "time,file\n3,Bild 1.jpg\n4, b.jpg\n")) == [("Bild 1.jpg", 3.0), ("b.jpg", 4.0)]
+    assert read_times(text(tmp_path, "time,file\n3,Bild 1.jpg\n4 b.jpg,\n")) == [("Bild 1.jpg", 3.0), ("b.jpg", 4.0)]
 
 
 @pytest.mark.parametrize(
@@ -77,6 +77,7 @@ def test_times(tmp_path: Path) -> None:
         (read_kitti, "0 0 0 1 0 0 0 1\n", "line 1: 8 numbers as TUM's format has, expected 12"),
         (read_kitti, "1 0 0 0 0 1.1 0 0 0 0 1 0\n", "line 1: not a rotation and a translation"),
         (read_times, "1 2 3\n", "line 1: 3 words"),
+        (read_times, "2013-05-28 08:46:02,123\n", "line 1: 3 words"),
         (read_times, "09:57:9.936530\n", r"line 1: '09:57:9\.936530' is not a finite number\. Write times as seconds"),
         (read_times, "a 1\n2\n", "line 2: some lines have a file's name"),
         (read_times, "\x00\xff\n", "line 1: .* is not a finite number"),

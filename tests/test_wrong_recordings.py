@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import re
 import shutil
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -422,10 +423,15 @@ def test_the_vehicle_is_masked_before_lidar_is_held_against_pictures(tmp_path: P
 
 
 def test_lidar_is_checked_again_if_files_are_newer(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Masks that are found are not what was given: they may hide most of a lens."""
     says = LidarCheck((), ("LiDAR is turned.",))
-    monkeypatch.setattr(build, "check_lidar", lambda *_: says)
-    cameras = ("right",)
+    cameras, rim = ("right",), np.hypot(*(np.indices((128, 128)) - 63.5)) < 30
+    monkeypatch.setattr("edge_depth_nerf.process.vehicle.dark_rim", lambda _: rim)
     edit(mine, lambda text: re.sub(r"(?m)^ego_mask.*\n", "", text))
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(build, "check_lidar", lambda *_: signal.raise_signal(signal.SIGINT))
+        run(mine, cameras=cameras, downscale=4)
+    monkeypatch.setattr(build, "check_lidar", lambda *_: says)
     with pytest.raises(InputError, match=r"^LiDAR is turned\. Without --strict"):
         run(mine, strict=True, cameras=cameras)
     # nothing is left of it that would bind the corrected drive

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -139,9 +139,9 @@ def write_camera_path(options: CameraPathOptions, console: Console | None = None
 def own_lens(scene: SceneFolder, picture: ScenePicture) -> KannalaBrandt | Pinhole:
     """A picture's lens; of a pinhole beside fisheyes, for which the scene has a stand-in, the pinhole."""
     original = scene.recorded("original_cameras", picture.camera)
-    if original.get("model") != Pinhole.model:
+    if isinstance(picture.lens, Pinhole) or original.get("model") != Pinhole.model:
         return picture.lens
-    return Pinhole(**{name: original[name] for name in ("width", "height", "fx", "fy", "cx", "cy")})
+    return Pinhole(**{entry.name: original[entry.name] for entry in fields(Pinhole) if entry.name in original})
 
 
 def film_lens(lens: KannalaBrandt | Pinhole, options: CameraPathOptions) -> FilmLens:

@@ -39,8 +39,8 @@ MOST_NOT_FINITE = 5
 """So many of them may be: the scaler of mixed precision skips such a step. NaN in a parameter stays, and makes more."""
 MOST_NAMED = 5
 """An error names so many pictures."""
-SAME_M = 0.05
-"""Scale and origin of a scene that differ by no more are the same."""
+SAME_M, SAME_SCALE = 0.05, 1e-3
+"""Origins and scales of a scene that differ by no more are the same."""
 _FITS = (
     "Load it with the options of its training (config.yml beside its folder has them) and its unchanged scene, or "
     "train again."
@@ -143,9 +143,10 @@ class EdgeDepthPipeline(VanillaPipeline):
         self.layers = DriveLayers(manager, model.detail)
         self._odd_steps = torch.zeros((), dtype=torch.long, device=device)
         # what a checkpoint's numbers mean nothing without, and what has no size: origin, scale, and cells of the grids
-        shift_m = manager.train_dataparser_outputs.dataparser_transform[:, 3].tolist()
+        outputs = manager.train_dataparser_outputs
         grids = [model.base_res, model.max_res, *(each["max_res"] for each in model.proposal_net_args_list)]
-        self.register_buffer("made_with", torch.tensor([*shift_m, metres_per_unit, *grids], dtype=torch.float64))
+        made_with = [*outputs.dataparser_transform[:, 3].tolist(), 1 / outputs.dataparser_scale, *grids]
+        self.register_buffer("made_with", torch.tensor(made_with, dtype=torch.float64))
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint as nerfstudio does.
@@ -160,19 +161,21 @@ class EdgeDepthPipeline(VanillaPipeline):
                 "This checkpoint has no hash tables: it was made with tiny-cuda-nn, which keeps them in another form. "
                 "Train again; the fused kernels need no tiny-cuda-nn and are faster."
             )
-        here, own = self.model.state_dict(), self.made_with.cpu()
+        here, own = self.model.state_dict(), self.made_with.cpu().clone()
         given = {name.replace("module.", "").removeprefix("_model."): value for name, value in loaded_state.items()}
         odd = [name for name, value in given.items() if name in here and here[name].shape != value.shape]
         if odd:
             raise InputError(f"The checkpoint's {', '.join(odd[:3])} have other sizes than here. {_FITS}")
         made_with = given.get("made_with", own).cpu()  # those of before have none
-        if len(made_with) != len(own) or not torch.allclose(made_with, own, rtol=0, atol=SAME_M):
+        same = len(made_with) == len(own) and torch.allclose(made_with[3:], own[3:], rtol=SAME_SCALE, atol=0)
+        if not same or (made_with[:3] - own[:3]).norm() > SAME_M:
             found, expected = (
                 f"{each[3]:.4g} m a unit, the origin at {_written(-each[:3])} m, grids of {_written(each[4:])} cells"
                 for each in (made_with, own)
             )
             raise InputError(f"The checkpoint was made with {found}; here are {expected}. {_FITS}")
         super().load_pipeline(loaded_state, step)
+        self.made_with.copy_(own)
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Any], dict[str, Any]]:
         """Outputs, losses and metrics of the next batch, as nerfstudio gives them.

@@ -30,7 +30,7 @@ from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.cameras.rays import rays
 from edge_depth_nerf.cameras.transforms import Transform
 from edge_depth_nerf.lidar import project_points, transform_points
-from edge_depth_nerf.masks.ego_files import EGO_MASKS
+from edge_depth_nerf.masks.ego_files import EGO_MASKS, ego_mask_path
 from edge_depth_nerf.masks.lens import lens_circle
 from edge_depth_nerf.masks.sky import find_sky
 from edge_depth_nerf.process.found_path import with_all_cameras
@@ -113,9 +113,9 @@ def process_recording(recording: Recording, options: ProcessOptions, console: Co
         # poses that come with the drive are checked before anything long; the vehicle, unmasked, looks like an error
         try:
             checked = _checked(recording, options, console)
-        except InputError:
+        except (InputError, KeyboardInterrupt):
+            # what is corrected begins anew
             if not masked_before:
-                # what is corrected begins anew
                 shutil.rmtree(options.output / EGO_MASKS, ignore_errors=True)
             raise
     recording, said = _posed(recording, options, console)
@@ -214,10 +214,10 @@ def _checked(recording: Recording, options: ProcessOptions, console: Console) ->
     if options.strict and found.warnings:
         raise InputError(" ".join(found.warnings) + " Without --strict this is a warning.")
     if not kept:
-        write_json(path, dataclasses.asdict(found))
         # they are repeated at the end; whoever sees them now may stop
         for warning in found.warnings:
             say(console, warning, "yellow")
+        write_json(path, dataclasses.asdict(found))
     return found
 
 
@@ -228,13 +228,22 @@ def _compared(recording: Recording, options: ProcessOptions, console: Console) -
     usable = {one.name: lens_circle(one.camera, options.theta_max_deg) for one in recording.cameras}
     with console.status("Comparing LiDAR with the pictures"):
         # where the path or a mask is wrong, LiDAR seems to be, too
-        of_masks = mask_warnings(recording, usable)
+        of_masks = mask_warnings(_with_given_masks_alone(recording, options.output), usable)
         for name, mask in masks.items():
             usable[name] = usable[name] & mask
         of_path, lost = path_warnings(recording, usable) if options.poses == "recorded" else ([], False)
         # where lengths or masks are wrong, LiDAR seems to be, too
         found = LidarCheck((), ()) if lost or of_masks else check_lidar(recording, usable)
         return dataclasses.replace(found, warnings=(*of_path, *of_masks, *found.warnings))
+
+
+def _with_given_masks_alone(recording: Recording, output: Path) -> Recording:
+    """Leave out the masks that were found: they may hide most of a lens, whose dark rim is in them."""
+    cameras = [
+        dataclasses.replace(camera, ego_mask=None) if camera.ego_mask == ego_mask_path(output, camera.name) else camera
+        for camera in recording.cameras
+    ]
+    return dataclasses.replace(recording, cameras=tuple(cameras))
 
 
 def _check_poses(recording: Recording, options: ProcessOptions) -> None:

@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 
 from edge_depth_nerf.base.console import run_jobs
 from edge_depth_nerf.base.errors import InputError
-from edge_depth_nerf.base.files import is_newer, read_image, read_json, read_mask, sha256_of, write_json, write_mask
+from edge_depth_nerf.base.files import is_newer, read_image, read_mask, sha256_of, write_mask, write_text
 from edge_depth_nerf.cameras import Camera
 from edge_depth_nerf.lidar import project_points, transform_points
 from edge_depth_nerf.lidar.free_space import FreeSpace
@@ -47,8 +47,6 @@ from edge_depth_nerf.process.sweep_store import Scanner, SweepStore, elevation_r
 
 MOVING_MASKS = "moving_masks"
 """Folder of the scene with the masks of what moves."""
-_FOUND = ".cache/moving_masks.json"
-"""SHA-256 of each mask when it was found: one that has another was corrected."""
 
 _FOOT_M = (0.06, 0.3)
 """LiDAR points between these heights above the ground are left out of the search for things; they are feet and
@@ -95,21 +93,14 @@ def find_moving(
             "--frame-masks."
         )
     paths = [moving_mask_path(options.output, picture) for picture in recording.pictures]
-    kept_at, sweeps = options.output / _FOUND, [sweep.path for sweep in recording.sweeps]
-    kept: dict[str, str] = read_json(kept_at) if kept_at.is_file() else {}
-
-    def stays(path: Path) -> bool:
-        return path.is_file() and (is_newer(path, sweeps) or kept.get(_key(path)) != sha256_of(path))
-
-    missing = [each for each in zip(paths, recording.pictures, strict=True) if not stays(each[0])]
+    sweeps = [sweep.path for sweep in recording.sweeps]
+    given = zip(paths, recording.pictures, strict=True)
+    missing = [each for each in given if not (is_newer(each[0], sweeps) or _was_corrected(each[0]))]
     if missing:
         store = SweepStore(recording, options, held_out)
         found = [_ScannersThings(scanner, held_out, console) for scanner in store.scanners]
         jobs = [partial(_write_mask, path, recording, picture, found, ego, options) for path, picture in missing]
-        try:
-            run_jobs(jobs, "Masking what moves", console)
-        finally:
-            write_json(kept_at, kept | {_key(path): sha256_of(path) for path, _ in missing if path.is_file()})
+        run_jobs(jobs, "Masking what moves", console)
     made = [path if path.is_file() else None for path in paths]
     pictures = [replace(picture, moving_mask=mask) for picture, mask in zip(recording.pictures, made, strict=True)]
     shares = [1 - float(read_mask(path).mean()) for path in made if path is not None]
@@ -121,8 +112,15 @@ def find_moving(
     return replace(recording, pictures=tuple(pictures)), [notice]
 
 
-def _key(mask: Path) -> str:
-    return f"{mask.parent.name}/{mask.name}"
+def _as_found(mask: Path) -> Path:
+    """The file with a mask's SHA-256 when it was found."""
+    return mask.parents[2] / ".cache" / MOVING_MASKS / mask.parent.name / f"{mask.stem}.sha256"
+
+
+def _was_corrected(mask: Path) -> bool:
+    """Whether there is a mask, and it is not the one that was found."""
+    found = _as_found(mask)
+    return mask.is_file() and not (found.is_file() and found.read_text(encoding="utf-8") == sha256_of(mask))
 
 
 class _ScannersThings:
@@ -219,6 +217,7 @@ def _write_mask(
             grown = _moving_pixels(image, camera, usable, recording.pose(picture), picture.time_s, things, seen)
             moving |= enlarge(grown, factor, (full.height, full.width))
     write_mask(path, ~moving)
+    write_text(_as_found(path), sha256_of(path))
 
 
 def _moving_pixels(

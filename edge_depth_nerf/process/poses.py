@@ -280,13 +280,14 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
         if words := " ".join(fields).split():
             if begun or not all(_HEADING.fullmatch(word) and not _is_number(word) for word in words):
                 # a name between commas may have spaces
-                yield number, words if len(fields) == 1 else [word for field in fields for word in _words(field)]
+                alone = len(words) <= 2 or len(fields) == 1
+                yield number, words if alone else [word for field in fields for word in _words(field)]
             begun = True
 
 
 def _words(field: str) -> list[str]:
     words = field.split()
-    return words if all(map(_is_number, words)) else [field.strip()]
+    return words if all(map(_is_number, words)) or seconds_of_date(field.strip()) is not None else [field.strip()]
 
 
 def _is_number(word: str) -> bool:
