@@ -29,7 +29,7 @@ MOST_LINES = {
     "edge_depth_nerf/plugin": 5_075,
     "edge_depth_nerf/plugin/fused": 685,
     "edge_depth_nerf/poses": 760,
-    "edge_depth_nerf/process": 5_705,
+    "edge_depth_nerf/process": 5_710,
     "edge_depth_nerf/process/bags": 1_760,
     "edge_depth_nerf/process/colmap": 1_655,
     "edge_depth_nerf/process/kitti": 365,

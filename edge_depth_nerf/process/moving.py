@@ -93,9 +93,10 @@ def find_moving(
             "--frame-masks."
         )
     paths = [moving_mask_path(options.output, picture) for picture in recording.pictures]
-    sweeps = [sweep.path for sweep in recording.sweeps]
+    sweeps = [sweep.path for sweep in recording.sweeps if sweep.path.exists()]
+    newest = sorted(sweeps, key=lambda path: path.stat().st_mtime_ns)[-1:]
     given = zip(paths, recording.pictures, strict=True)
-    missing = [each for each in given if not (is_newer(each[0], sweeps) or _was_corrected(each[0]))]
+    missing = [each for each in given if not (is_newer(each[0], newest) or _was_corrected(each[0]))]
     if missing:
         store = SweepStore(recording, options, held_out)
         found = [_ScannersThings(scanner, held_out, console) for scanner in store.scanners]
